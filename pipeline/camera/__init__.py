@@ -1,0 +1,1 @@
+"""Cameras: lens model, poses, markers."""

@@ -1,0 +1,1 @@
+"""Photographs: RAW files, radiometry, colour, error measures, display."""

@@ -1,0 +1,1 @@
+"""Light: directions on the lat-long, mirror balls, environment maps."""

@@ -1,0 +1,187 @@
+"""Kind of artifact -> how it is written and read. The only opener of build files.
+
+Everything appears whole: written to a temporary name in the same folder, then renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.conventions import ACESCG
+from pipeline.run.errors import ArtifactError
+from pipeline.run.stage import Artifact
+from pipeline.types import Raster
+
+AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary sibling that replaces ``path`` when the block ends well and vanishes when it does not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield scratch / path.name
+        if path.is_dir():
+            path.rename(scratch / "old")
+        os.replace(scratch / path.name, path)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a small file atomically."""
+    with atomic_path(path) as scratch:
+        scratch.write_bytes(data)
+
+
+def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
+    """Write a single-part scanline EXR, float32 (or half) and uint32 channels, ZIP.
+
+    Raises ValueError when channels differ in size. OpenEXR writes wrong pixels from non-contiguous arrays, so every
+    channel is made contiguous first.
+    """
+    import OpenEXR
+
+    shapes = {values.shape for values in raster.channels.values()}
+    if len(shapes) != 1:
+        raise ValueError(f"{path}: channels of different sizes {sorted(shapes)}")
+    float_type = np.float16 if half else np.float32
+    channels = {
+        name: np.ascontiguousarray(values, values.dtype if values.dtype == np.uint32 else float_type)
+        for name, values in raster.channels.items()
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **raster.attributes}
+    header["insitu:space"] = raster.space
+    if raster.space == ACESCG:
+        header["chromaticities"] = AP1_CHROMATICITIES
+    with atomic_path(path) as scratch:
+        OpenEXR.File(header, channels).write(str(scratch))
+
+
+def read_exr(path: Path, space: str | None = None) -> Raster:
+    """Read an EXR, all channels as stored (half widened to float32).
+
+    ``space`` None takes what the file says. Raises ArtifactError when it cannot be read, or its space is another one.
+    """
+    import OpenEXR
+
+    if not path.exists():
+        raise ArtifactError(f"{path}: missing; run the stage that writes it")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header, pixels = file.header(), file.channels()
+            channels = {
+                name: np.asarray(c.pixels, np.uint32 if c.pixels.dtype == np.uint32 else np.float32)
+                for name, c in pixels.items()
+            }
+    except (RuntimeError, ValueError) as error:
+        raise ArtifactError(f"{path}: not a readable EXR ({error})") from error
+    found = header.get("insitu:space")
+    if found is None:
+        found = space_of_chromaticities(header.get("chromaticities"))
+    if space is not None and found is not None and found != space:
+        raise ArtifactError(f"{path}: colour space is {found}, expected {space}; re-run the stage that writes it")
+    known = {"compression", "type", "channels", "insitu:space", "chromaticities", "dataWindow", "displayWindow"}
+    return Raster(channels, found or space or "unknown", {k: v for k, v in header.items() if k not in known})
+
+
+def space_of_chromaticities(chromaticities: Any) -> str | None:
+    """``acescg``, ``linear_rec709`` or None for the EXR attribute of eight floats."""
+    if chromaticities is None:
+        return None
+    values = np.asarray(chromaticities, float).ravel()
+    for name, known in ((ACESCG, AP1_CHROMATICITIES), ("linear_rec709", REC709_CHROMATICITIES)):
+        if np.allclose(values, known, atol=2e-4):
+            return name
+    return None
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Write (H, W, 3) or (H, W) uint8."""
+    from PIL import Image
+
+    with atomic_path(path) as scratch:
+        Image.fromarray(np.ascontiguousarray(picture)).save(scratch, format="PNG", compress_level=4)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """(H, W, C) or (H, W) as stored, 8 or 16 bit."""
+    import cv2
+
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise ArtifactError(f"{path}: not a readable picture")
+    return picture if picture.ndim == 2 else np.ascontiguousarray(picture[..., 2::-1])
+
+
+def write(folder: Path, artifact: Artifact, value: Any) -> Path:
+    """Write a value as its artifact says; returns the path."""
+    path = folder / artifact.filename
+    if artifact.kind == "json":
+        from pydantic import TypeAdapter
+
+        adapter = TypeAdapter(artifact.type)
+        write_bytes(path, adapter.dump_json(value, indent=1) + b"\n")
+    elif artifact.kind == "raster":
+        _check(path, artifact, value)
+        write_exr(path, value)
+    elif artifact.kind == "rasters":
+        with atomic_path(path) as scratch:
+            for name, raster in value.items():
+                _check(path / name, artifact, raster)
+                write_exr(scratch / f"{name}.exr", raster)
+            scratch.mkdir(exist_ok=True)
+    elif artifact.kind == "picture":
+        write_png(path, value)
+    else:
+        write_bytes(path, value.encode())
+    return path
+
+
+def _check(path: Path, artifact: Artifact, raster: Raster) -> None:
+    if raster.space != artifact.space:
+        raise ArtifactError(f"{path}: stage wrote colour space {raster.space}, declared {artifact.space}")
+
+
+def read(folder: Path, artifact: Artifact) -> Any:
+    """Read an artifact back; raises ArtifactError when it is missing or not what its row says."""
+    path = folder / artifact.filename
+    if not path.exists():
+        raise ArtifactError(f"{path}: missing; run the stage that writes {artifact.name}")
+    if artifact.kind == "json":
+        from pydantic import TypeAdapter, ValidationError
+
+        try:
+            return TypeAdapter(artifact.type).validate_json(path.read_bytes())
+        except ValidationError as error:
+            raise ArtifactError(f"{path}: does not read as {artifact.name} ({error.error_count()} problems)") from error
+    if artifact.kind == "raster":
+        return read_exr(path, artifact.space)
+    if artifact.kind == "rasters":
+        return {file.stem: read_exr(file, artifact.space) for file in sorted(path.glob("*.exr"))}
+    if artifact.kind == "picture":
+        return read_png(path)
+    return path.read_text()
+
+
+def digest(path: Path) -> str:
+    """sha256 of a file, or of the names and contents of a folder."""
+    total = hashlib.sha256()
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if path.is_dir():
+            total.update(str(file.relative_to(path)).encode())
+        if file.is_file():
+            with file.open("rb") as stream:
+                total.update(hashlib.file_digest(stream, "sha256").digest())
+    return total.hexdigest()

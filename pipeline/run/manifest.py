@@ -1,0 +1,261 @@
+"""capture.toml (facts of what was photographed) and scene.toml (wishes): validated, all problems at once.
+
+Imports no numpy: a refused manifest answers at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.run.errors import ManifestError
+
+Rgb = tuple[float, float, float]
+Matrix4 = list[list[float]]
+
+
+class Strict(BaseModel):
+    """Immutable, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PlateFacts(Strict):
+    """The photograph that objects are put into."""
+
+    files: list[str] = Field(min_length=1, description="RAW files or globs, relative to root")
+
+
+class BallFacts(Strict):
+    """One view of the mirror ball."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    files: list[str] = Field(min_length=1)
+    tripod: bool = Field(False, description="taken from the plate's own camera position")
+
+
+class ProbeFacts(Strict):
+    """What stood in for the objects."""
+
+    kind: Literal["mirror_ball"] = "mirror_ball"
+    diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
+    reflectance: Rgb = Field((1.0, 1.0, 1.0), description="linear RGB reflectance of the ball")
+    reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
+
+
+class BoardFacts(Strict):
+    """The printed ChArUco board that defines the world."""
+
+    dictionary: str = "DICT_5X5_100"
+    squares: tuple[int, int] = Field(description="along x, along y")
+    square_m: float = Field(gt=0.001, lt=1.0)
+    marker_m: float = Field(gt=0.0005, lt=1.0)
+    margin_m: float = Field(0.0, ge=0, description="white paper around the print")
+    legacy: bool = False
+
+
+class MarkerFacts(Strict):
+    """A single ArUco or AprilTag marker that defines the world."""
+
+    dictionary: str = "DICT_5X5_100"
+    id: int = Field(ge=0)
+    side_m: float = Field(gt=0.001, lt=5.0)
+
+
+class CameraFacts(Strict):
+    """Where the intrinsics come from: board photographs, or given numbers (pixel origin of conventions)."""
+
+    calibration: list[str] = Field([], description="board photographs, files or globs")
+    given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
+
+
+class PointFacts(Strict):
+    """A surveyed point and where it is seen."""
+
+    world_m: tuple[float, float, float]
+    px: tuple[float, float] = Field(description="first pixel centre at (0.5, 0.5)")
+
+
+class PoseFacts(Strict):
+    """How one view is oriented when not by the board."""
+
+    view: str
+    route: Literal["charuco", "marker", "points", "given"]
+    points: list[PointFacts] = []
+    world_from_camera: Matrix4 | None = None
+
+
+class ExposureFacts(Strict):
+    """Exposure of files whose EXIF is missing or wrong."""
+
+    files: list[str]
+    exposure_s: float | None = Field(None, gt=0)
+    iso: float | None = Field(None, gt=0)
+    fnumber: float | None = Field(None, gt=0)
+
+
+class CaptureFacts(Strict):
+    """capture.toml."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    root: str = Field(".", description="where the photographs lie; relative to this file; environment variables expand")
+    plate: PlateFacts
+    ball: list[BallFacts] = Field(min_length=1)
+    probe: ProbeFacts
+    board: BoardFacts | None = None
+    marker: MarkerFacts | None = None
+    camera: CameraFacts = CameraFacts()
+    pose: list[PoseFacts] = []
+    exposure: list[ExposureFacts] = []
+    truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> CaptureFacts:
+        names = [ball.name for ball in self.ball]
+        if "plate" in names or len(set(names)) < len(names):
+            raise ValueError(f"ball names are {names}; each must be unique and none may be 'plate'")
+        views = {"plate", *names}
+        unknown = [pose.view for pose in self.pose if pose.view not in views]
+        if unknown:
+            raise ValueError(f"pose.view is {unknown}; expected one of {sorted(views)}")
+        if not self.camera.calibration and self.camera.given is None:
+            raise ValueError("camera: neither calibration photographs nor given numbers")
+        if self.camera.calibration and self.board is None:
+            raise ValueError("camera.calibration needs [board]")
+        return self
+
+
+class MaterialWish(Strict):
+    """Metallic-roughness material; replaces the file's own. Colours are linear in ``space``."""
+
+    base_color: Rgb = (0.8, 0.8, 0.8)
+    metallic: float = Field(0.0, ge=0, le=1)
+    roughness: float = Field(0.5, ge=0, le=1)
+    space: Literal["linear_rec709", "acescg"] = "linear_rec709"
+
+
+class ObjectWish(Strict):
+    """One object and where it stands."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    file: str = Field(description=".glb, .obj or .ply; relative to scene.toml, else to the capture's root")
+    position_m: tuple[float, float] = Field(description="x and z on the plane, world frame")
+    lift_m: float = Field(0.0, description="height of the object's origin above the plane")
+    yaw_deg: float = Field(0.0, description="about +Y, counter-clockwise seen from above")
+    scale: float = Field(1.0, gt=0, description="metres per unit of the file")
+    material: MaterialWish | None = None
+
+
+class SceneWishes(Strict):
+    """scene.toml, less the knobs of the stages (tables named after a stage, checked against stages/knobs.py)."""
+
+    object: list[ObjectWish] = []
+    quality: Literal["draft", "preview", "final"] = "preview"
+
+    @model_validator(mode="after")
+    def _unique(self) -> SceneWishes:
+        names = [wish.name for wish in self.object]
+        if len(set(names)) < len(names):
+            raise ValueError(f"object names are {names}; each must be unique")
+        return self
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises ManifestError when it is missing or not TOML."""
+    if not path.is_file():
+        raise ManifestError(f"{path}: no such file")
+    try:
+        return tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{path}: not valid TOML: {error}") from error
+
+
+def problems_of(error: ValidationError, path: Path, model: type[BaseModel], prefix: str = "") -> list[str]:
+    """One line per problem: file:line: key: what was found; what was expected."""
+    text = path.read_text().splitlines() if path.is_file() else []
+    lines = []
+    for item in error.errors(include_url=False):
+        keys = [*([prefix] if prefix else []), *[str(part) for part in item["loc"]]]
+        dotted = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(keys)) or model.__name__
+        where = f"{path}:{number}" if (number := line_of(text, keys)) else str(path)
+        if item["type"] == "extra_forbidden":
+            close = difflib.get_close_matches(keys[-1], known_keys(model, item["loc"][:-1]), 1)
+            lines.append(f"{where}: {dotted}: unknown key" + (f"; did you mean {close[0]}?" if close else ""))
+        elif item["type"] == "missing":
+            lines.append(f"{where}: {dotted}: missing; it is required")
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            found = "" if item["type"] == "value_error" else f"is {item['input']!r}; expected: "
+            lines.append(f"{where}: {dotted}: {found}{message}")
+    return lines
+
+
+def known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields of the model that ``loc`` points into."""
+    current: Any = model
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        field = getattr(current, "model_fields", {}).get(part)
+        if field is None:
+            return []
+        options = [field.annotation, *getattr(field.annotation, "__args__", ())]
+        current = next((option for option in options if isinstance(option, type) and issubclass(option, BaseModel)), None)
+    return list(getattr(current, "model_fields", {}))
+
+
+def line_of(text: list[str], keys: list[str]) -> int | None:
+    """Line of the key in a TOML text, found by its table headings; None when it is not there."""
+    names = [key for key in keys if not key.isdigit()]
+    index = next((int(key) for key in keys if key.isdigit()), 0)
+    table, seen, heading = "", -1, None
+    for number, line in enumerate(text, 1):
+        if match := re.match(r"\s*\[\[?\s*([\w.\-]+)\s*\]\]?", line):
+            table = match[1]
+            if table == names[0]:
+                seen += 1
+                if seen == index or heading is None:
+                    heading = number
+        elif match := re.match(r"\s*([\w\-]+)\s*=", line):
+            full = [*([part for part in table.split(".") if part]), match[1]]
+            if full == names and (seen == index or seen < 0 or "[[" not in "".join(text)):
+                return number
+    return heading
+
+
+def load_capture(folder: Path) -> tuple[CaptureFacts, Path, Path]:
+    """Facts, path of capture.toml, and the resolved root of a capture folder (or of a capture.toml).
+
+    Raises ManifestError with every problem at once.
+    """
+    path = folder if folder.suffix == ".toml" else folder / "capture.toml"
+    data = load_toml(path)
+    try:
+        facts = CaptureFacts.model_validate(data)
+    except ValidationError as error:
+        raise ManifestError(*problems_of(error, path, CaptureFacts)) from error
+    root = (path.parent / os.path.expandvars(facts.root)).resolve()
+    if not root.is_dir():
+        raise ManifestError(f"{path}: root: is {facts.root!r}, which is no folder ({root})")
+    return facts, path, root
+
+
+def resolve_files(patterns: list[str], root: Path, where: str) -> tuple[list[Path], list[str]]:
+    """Files of names and globs, sorted and unique, and the problems found."""
+    files: set[Path] = set()
+    problems = []
+    for pattern in patterns:
+        found = sorted(root.glob(pattern)) if any(c in pattern for c in "*?[") else [root / pattern]
+        found = [file for file in found if file.is_file()]
+        if not found:
+            problems.append(f"{where}: is {pattern!r}; no such file in {root}")
+        files.update(found)
+    return sorted(files), problems
+
+

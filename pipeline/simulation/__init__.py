@@ -1,0 +1,1 @@
+"""Captures with known truth. Shares no estimation code with the stages it tests."""

@@ -1,0 +1,1 @@
+"""Transport: scenes, materials and the path tracer."""

@@ -1,0 +1,152 @@
+"""What passes between stages: frozen records whose fields state shape, unit, space and frame.
+
+Small records are pydantic models (validated, written as JSON, arrays as lists); pictures are `Raster`s (written as EXR).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+
+Array = Annotated[
+    np.ndarray,
+    BeforeValidator(lambda value: np.asarray(value, float)),
+    PlainSerializer(lambda value: value.tolist(), return_type=list),
+]
+
+
+class Record(BaseModel):
+    """A small immutable record that is written as JSON."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, ser_json_inf_nan="constants")
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """A picture on disk: named float32 or uint32 channels of one size, and its header.
+
+    ``channels``: name -> (H, W). Names follow OpenEXR: ``R G B``, ``variance.R`` ..., ``mask`` (uint32), ``Y``.
+    ``space``: ``acescg``, ``camera_rgb`` or ``data``. ``attributes``: str, int, float or matrices for the EXR header.
+    """
+
+    channels: dict[str, np.ndarray]
+    space: str
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return next(iter(self.channels.values())).shape  # type: ignore[return-value]
+
+    def rgb(self, layer: str = "") -> np.ndarray:
+        """(H, W, 3) float32 of the layer: ``""`` reads R G B, ``"variance"`` reads variance.R and so on."""
+        prefix = f"{layer}." if layer else ""
+        return np.stack([self.channels[prefix + c] for c in "RGB"], -1)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.channels[name]
+
+    @staticmethod
+    def split(rgb: np.ndarray, layer: str = "") -> dict[str, np.ndarray]:
+        """The three named channels of an (H, W, 3) array, for building ``channels``."""
+        prefix = f"{layer}." if layer else ""
+        return {prefix + c: rgb[..., i] for i, c in enumerate("RGB")}
+
+
+class Frame(Record):
+    """One RAW file of a bracket: what its metadata and its manifest say. Nothing here is estimated."""
+
+    file: str  # relative to the capture's root
+    sha256: str
+    exposure_s: float  # label
+    iso: float
+    fnumber: float
+    width: int
+    height: int
+    cfa: str  # colours of the 2x2 cell read in rows, "RGGB"; "" for data that are already (H, W, 3)
+    black: Array  # (2, 2) or (1, 1), DN, in CFA cell order
+    white: float  # DN
+    camera: str = ""
+    timestamp: str = ""
+    color_matrix: Array | None = None  # (3, 3) ColorMatrix1, camera_rgb from XYZ
+    color_matrix_2: Array | None = None
+    illuminant: int = 0  # EXIF LightSource code of ColorMatrix1
+    illuminant_2: int = 0
+    as_shot_neutral: Array | None = None  # (3,)
+    noise_profile: Array | None = None  # (2,) or (6,): DNG NoiseProfile S, O of signal normalised to [0, 1]
+    focal_mm: float = 0.0
+
+
+class Bracket(Record):
+    """The frames of one view, sorted from the shortest to the longest exposure."""
+
+    name: str
+    role: str  # "plate" or "ball"
+    frames: list[Frame]
+
+
+class Camera(Record):
+    """Pinhole with Brown distortion. ``K`` and the pixel origin as in conventions: first pixel centre at (0.5, 0.5)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Array = np.zeros(5)  # (5,) k1 k2 p1 p2 k3, OpenCV's order
+    covariance: Array = np.zeros((9, 9))  # of (fx, fy, cx, cy, k1, k2, p1, p2, k3), px and 1
+    rms_px: float = 0.0
+    source: str = "given"
+
+    @property
+    def K(self) -> np.ndarray:  # noqa: N802 - the field's name for it
+        """(3, 3) intrinsic matrix, pixel origin of conventions."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+
+class View(Record):
+    """Where one photograph was taken from."""
+
+    world_from_camera: Array  # (4, 4), metres
+    covariance: Array  # (6, 6), see conventions
+    route: str  # charuco, marker, points, given, colmap, same_as
+    rms_px: float
+    points: int  # image points used
+    ambiguity: float = np.inf  # squared residual of the second planar solution over the first
+    alternative: Array | None = None  # (4, 4) the second planar solution, refined
+
+
+class BallFit(Record):
+    """The sphere seen in one view, in that view's camera frame."""
+
+    centre_camera_m: Array  # (3,)
+    radius_m: float
+    covariance: Array  # (3, 3) of the centre, m^2
+    rms_px: float
+    points: int
+    radius_px: float
+
+
+class Plane(Record):
+    """The local scene's plane ``normal . p = offset_m`` in the world frame, and the rectangle that is modelled."""
+
+    normal: Array  # (3,) unit, outward
+    offset_m: float
+    covariance: Array  # (3, 3) of (tilt about x [rad], tilt about z [rad], offset [m])
+    corners_m: Array  # (4, 3) counter-clockwise seen from outside
+    source: str
+    contact_sigma_px: float = 0.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a stage's compute returns: outputs by name, measured numbers, warnings, and evidence for model choices."""
+
+    outputs: dict[str, Any]
+    numbers: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    evidence: list[dict[str, Any]] = field(default_factory=list)  # {"term", "modelled", "because", "could_cost"}

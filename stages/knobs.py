@@ -1,0 +1,116 @@
+"""Every knob of every stage with its default, range and meaning, and the presets that set several.
+
+Here rather than in the rooms so that a wrong scene.toml is refused without importing numpy. A stage's digest holds the
+values it was given, not this file.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    """Base of the knobs of one stage: immutable, unknown names refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Ingest(Params):
+    """No knobs: the manifest says it all."""
+
+
+class Merge(Params):
+    """Merging brackets."""
+
+    weights: Literal["poisson", "optimal"] = Field("optimal", description="per-sample weights")
+    estimate_exposures: bool = Field(True, description="estimate exposure ratios instead of trusting labels")
+
+
+class Develop(Params):
+    """From mosaic to ACEScg."""
+
+    demosaic: Literal["bilinear", "malvar", "menon"] = Field("malvar", description="demosaicking method")
+
+
+class Calibrate(Params):
+    """Intrinsics from board photographs."""
+
+    max_rms_px: float = Field(1.0, gt=0, description="refuse a calibration with a larger residual [px]")
+
+
+class Pose(Params):
+    """Pose of every view."""
+
+    corner_sigma_px: float = Field(0.1, gt=0, description="standard uncertainty of a detected corner [px]")
+    min_ambiguity: float = Field(4.0, gt=1, description="refuse when the second planar solution is nearer than this chi2 ratio")
+
+
+class Probe(Params):
+    """From mirror-ball photographs to an environment map."""
+
+    width: int = Field(1024, ge=64, le=8192, description="width of the lat-long [px]; its height is half")
+    supersample: int = Field(3, ge=1, le=16, description="samples per texel and axis")
+    rim: float = Field(0.97, gt=0.5, lt=1, description="outermost radius used, as a fraction of the ball's")
+
+
+class Plane(Params):
+    """The local scene's plane."""
+
+    extent: float = Field(8.0, ge=1, description="half size of the modelled rectangle in object sizes")
+
+
+class Reflectance(Params):
+    """Albedo of the local scene."""
+
+    model: Literal["uniform", "textured"] = Field("textured", description="albedo model of the plane")
+    texture_px: int = Field(1024, ge=16, le=8192, description="size of the albedo texture [px]")
+
+
+class Render(Params):
+    """With and without the objects."""
+
+    samples: int = Field(64, ge=1, le=65536, description="samples per pixel")
+    depth: int = Field(6, ge=2, le=64, description="longest path [vertices]")
+    threshold: float = Field(0.002, ge=0, le=0.05, description="change below this fraction is left to the plate")
+    seed: int = Field(0, ge=0, description="seed of the sampler")
+
+
+class Composite(Params):
+    """Putting it together."""
+
+    kind: Literal["additive", "ratio", "auto"] = Field("auto", description="equation 4, equation 5, or chosen per pixel")
+    view: str = Field("ACES 2.0 - SDR 100 nits (Rec.709)", description="OCIO view of the display picture")
+    display: str = Field("sRGB - Display", description="OCIO display")
+    exposure_ev: float = Field(0.0, ge=-20, le=20, description="exposure of the display picture over the automatic one [EV]")
+
+
+class Evaluate(Params):
+    """Error against truth, prediction without it."""
+
+    pixels_per_degree: float = Field(67.0, gt=0, description="viewing condition of FLIP [px/deg]")
+
+
+class Report(Params):
+    """The page."""
+
+
+KNOBS: dict[str, type[Params]] = {
+    "ingest": Ingest, "merge": Merge, "develop": Develop, "calibrate": Calibrate, "pose": Pose, "probe": Probe,
+    "plane": Plane, "reflectance": Reflectance, "render": Render, "composite": Composite, "evaluate": Evaluate,
+    "report": Report,
+}  # fmt: skip
+
+# What each preset changes from the defaults above.
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
+    "draft": {
+        "merge": {"weights": "poisson"}, "develop": {"demosaic": "bilinear"}, "probe": {"width": 512, "supersample": 2},
+        "reflectance": {"texture_px": 512}, "render": {"samples": 8, "depth": 4},
+    },
+    "preview": {},
+    "final": {
+        "develop": {"demosaic": "menon"}, "probe": {"width": 2048, "supersample": 4},
+        "reflectance": {"texture_px": 2048}, "render": {"samples": 512, "depth": 10, "threshold": 0.001},
+    },
+}  # fmt: skip
