@@ -1,0 +1,102 @@
+"""Laws of the lens: inverse, derivatives, fold, agreement with OpenCV."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.camera import lens
+from pipeline.run.errors import NumericalError
+from pipeline.types import Camera
+
+BARREL = np.array([-0.28, 0.09, 1.2e-3, -8e-4, -0.012])
+PINCUSHION = np.array([0.12, 0.03, -6e-4, 9e-4, 0.01])
+
+
+def camera_with(distortion: np.ndarray, width: int = 1024, height: int = 768) -> Camera:
+    return Camera(width=width, height=height, fx=1100.0, fy=1093.0, cx=519.3, cy=377.1, distortion=distortion)
+
+
+def pixels_of(camera: Camera, count: int = 4000) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return rng.uniform(0, 1, (count, 2)) * (camera.width, camera.height)
+
+
+@pytest.mark.parametrize("distortion", [np.zeros(5), BARREL, PINCUSHION])
+def test_unproject_inverts_project(distortion: np.ndarray) -> None:
+    camera = camera_with(distortion)
+    px = pixels_of(camera)
+    rays = lens.pixel_rays(camera, px)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-14)
+    assert np.abs(lens.project(camera, rays * 3.7) - px).max() < 1e-9  # rounding of ~1e3 px
+    # The same ray stored in float32 moves by 6e-8 of 1100 px at most.
+    assert np.abs(lens.project(camera, rays.astype(np.float32)) - px).max() < 3e-4
+
+
+def test_ray_grid_is_unproject_and_its_derivative() -> None:
+    camera = camera_with(BARREL, 97, 61)
+    xn, dxn = lens.ray_grid(camera)
+    assert xn.shape == (61, 97, 2)
+    rows, cols = np.mgrid[:61, :97]
+    centre = np.stack([cols + 0.5, rows + 0.5], -1).reshape(-1, 2)
+    np.testing.assert_array_equal(xn.reshape(-1, 2), lens.unproject(camera, centre))
+    step = 1e-3
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        numeric = (lens.unproject(camera, centre + shift) - lens.unproject(camera, centre - shift)) / (2 * step)
+        # central difference: rounding 1e-16 / 1e-3 dominates
+        np.testing.assert_allclose(dxn[..., axis].reshape(-1, 2), numeric, atol=1e-12)
+
+
+def test_jitter_through_the_derivative_stays_on_the_pixel() -> None:
+    camera = camera_with(BARREL)
+    xn, dxn = lens.ray_grid(camera)
+    jitter = np.array([0.5, -0.5])
+    moved = xn + dxn @ jitter
+    rays = np.concatenate([moved, np.ones((*moved.shape[:2], 1))], -1).reshape(-1, 3)
+    rows, cols = np.mgrid[: camera.height, : camera.width]
+    aim = np.stack([cols + 0.5, rows + 0.5], -1).reshape(-1, 2) + jitter
+    assert np.abs(lens.project(camera, rays) - aim).max() < 1e-3  # second order: |f''| / 8 of strong barrel distortion
+
+
+def test_jacobians_against_differences() -> None:
+    camera = camera_with(BARREL)
+    points = lens.pixel_rays(camera, pixels_of(camera, 50)) * 2.0
+    px, by_point, by_lens = lens.project_jacobians(camera, points)
+    np.testing.assert_allclose(px, lens.project(camera, points), atol=1e-10)
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        numeric = (lens.project(camera, points + step) - lens.project(camera, points - step)) / 2e-6
+        np.testing.assert_allclose(by_point[:, :, axis], numeric, rtol=1e-6, atol=1e-5)
+    values = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+    def moved(vector: np.ndarray) -> np.ndarray:
+        fx, fy, cx, cy = vector[:4]
+        other = Camera(width=1024, height=768, fx=fx, fy=fy, cx=cx, cy=cy, distortion=vector[4:])
+        return lens.project(other, points)
+
+    for column in range(9):
+        step = 1e-5 * np.eye(9)[column]
+        numeric = (moved(values + step) - moved(values - step)) / 2e-5
+        np.testing.assert_allclose(by_lens[:, :, column], numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_agrees_with_opencv() -> None:
+    cv2 = pytest.importorskip("cv2")
+    camera = camera_with(PINCUSHION)
+    points = lens.pixel_rays(camera, pixels_of(camera, 200)) * 1.7
+    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, camera.distortion)[0].reshape(-1, 2)
+    np.testing.assert_allclose(lens.project(camera, points), theirs + 0.5, atol=1e-8)
+
+
+def test_behind_and_beyond_the_fold() -> None:
+    barrel = np.array([-0.3, 0, 0, 0, 0])
+    camera = camera_with(barrel)
+    assert lens.fold_radius_squared(barrel) == pytest.approx(1 / 0.9)
+    assert lens.fold_radius_squared(np.zeros(5)) == np.inf
+    px = lens.project(camera, np.array([[0, 0, -1.0], [0, 0, 0], [2.0, 0, 1], [0.1, 0, 1]]))
+    assert np.isnan(px[:3]).all()
+    assert np.isfinite(px[3]).all()
+    with pytest.raises(NumericalError, match="1 of 1 positions"):
+        lens.unproject(camera, np.array([[4000.0, 400.0]]))
