@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.image import display
+from pipeline.run.errors import ManifestError
+
+PLAIN = "Un-tone-mapped"
+
+
+@pytest.fixture(autouse=True)
+def builtin_config(monkeypatch):
+    monkeypatch.delenv("OCIO", raising=False)
+
+
+def srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_neutral_ramp_is_the_srgb_curve():
+    grey = np.linspace(0, 1, 256)
+    coded = display.display_transform(np.repeat(grey[None, :, None], 3, -1), view=PLAIN)
+    # One code value: rounding, and the 1e-4 of the D60 to D65 adaptation.
+    assert np.abs(coded[0].astype(int) - np.round(255 * srgb(grey))[:, None]).max() <= 1
+
+
+def test_aces_grey():
+    # 18 % grey through ACES 2.0 is 0.349 of full code.
+    assert display.display_transform(np.full((1, 1, 3), 0.18)).tolist() == [[[89, 89, 89]]]
+
+
+def test_exposure_is_a_factor():
+    rgb = np.random.default_rng(1).random((9, 7, 3)).astype(np.float32)
+    brighter = display.display_transform(rgb, exposure_ev=1.0)
+    assert np.array_equal(brighter, display.display_transform(2 * rgb))
+
+
+def test_threads_and_strides_do_not_matter():
+    rgb = np.random.default_rng(2).random((31, 17, 3)).astype(np.float32)
+    whole = display.display_transform(rgb)
+    rows = np.concatenate([display.display_transform(rgb[i : i + 1]) for i in range(31)])
+    assert np.array_equal(whole, rows)
+    assert np.array_equal(display.display_transform(rgb[:, ::-1])[:, ::-1], whole)
+
+
+def test_input_is_left_alone():
+    rgb = np.full((3, 3, 3), 0.5, np.float32)
+    display.display_transform(rgb, exposure_ev=2)
+    assert (rgb == 0.5).all()
+
+
+def test_extremes_are_shown_not_hidden():
+    rgb = np.array([[[np.nan, 1, 1], [np.inf, 0, 0], [-1, -1, -1], [1e30, 1e30, 1e30]]])
+    coded = display.display_transform(rgb, view=PLAIN)
+    assert coded.tolist() == [[[255, 0, 255], [255, 0, 255], [0, 0, 0], [255, 255, 255]]]
+
+
+@pytest.mark.parametrize(("name", "view"), [("Radio", PLAIN), ("sRGB - Display", "Sepia")])
+def test_wrong_names_list_the_right_ones(name, view):
+    with pytest.raises(ManifestError, match=r"sRGB - Display|Un-tone-mapped"):
+        display.display_transform(np.zeros((1, 1, 3)), name, view)
+
+
+def test_wrong_config(monkeypatch, tmp_path):
+    monkeypatch.setenv("OCIO", str(tmp_path / "none.ocio"))
+    with pytest.raises(ManifestError, match="OCIO"):
+        display.display_transform(np.zeros((1, 1, 3)))
+
+
+SMALL_CONFIG = """ocio_profile_version: 2
+roles: {aces_interchange: ap0, cie_xyz_d65_interchange: xyz, default: ap0}
+displays:
+  Box:
+    - !<View> {name: Plain, colorspace: coded}
+colorspaces:
+  - !<ColorSpace> {name: ap0}
+  - !<ColorSpace> {name: coded, from_scene_reference: !<ExponentTransform> {value: 2, direction: inverse}}
+display_colorspaces:
+  - !<ColorSpace> {name: xyz}
+"""
+
+
+def test_config_without_acescg_uses_the_interchange_role(monkeypatch, tmp_path):
+    path = tmp_path / "small.ocio"
+    path.write_text(SMALL_CONFIG)
+    monkeypatch.setenv("OCIO", str(path))
+    rgb = np.random.default_rng(3).random((8, 8, 3))
+    expected = np.round(255 * np.sqrt((rgb @ display.AP0_FROM_AP1.T).clip(0, 1)))
+    assert np.abs(display.display_transform(rgb, "Box", "Plain") - expected).max() <= 1
+
+
+def test_auto_exposure_follows_exposure():
+    rgb = np.random.default_rng(4).random((20, 20, 3))
+    first = display.auto_exposure(rgb)
+    assert display.auto_exposure(4 * rgb) == pytest.approx(first - 2)
+    assert np.median((rgb * 2**first) @ display.AP1_LUMINANCE) == pytest.approx(0.18)
+    assert display.auto_exposure(np.full((2, 2, 3), np.nan)) == 0.0
+    assert display.auto_exposure(np.zeros((2, 2, 3))) == 0.0
+
+
+def test_constants_against_colour_science():
+    colour = pytest.importorskip("colour")
+    space = colour.models.RGB_COLOURSPACE_ACESCG
+    assert np.allclose(space.matrix_RGB_to_XYZ[1], display.AP1_LUMINANCE, atol=1e-6)
+    ap0 = colour.matrix_RGB_to_RGB(space, colour.models.RGB_COLOURSPACE_ACES2065_1, None)
+    assert np.allclose(ap0, display.AP0_FROM_AP1, atol=1e-6)
