@@ -53,3 +53,6 @@ METRICS = Artifact("metrics", "json", "errors against truth; empty without truth
 SELFCHECK = Artifact("selfcheck", "json", "predictions of what really stood there", type=dict[str, Any])
 ERROR_MAP = Artifact("error_map", "raster", "relative error and change error against truth: relative, change", "1", "data")
 REPORT = Artifact("report", "page", "one self-contained page")
+
+# Supplied by the runner: stage -> numbers, warnings, evidence, params, seconds of every earlier stage.
+RECORDS = Artifact("records", "records", "what every earlier stage measured")

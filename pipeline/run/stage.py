@@ -22,7 +22,7 @@ class Artifact:
     @property
     def filename(self) -> str:
         """Path below the stage's folder."""
-        suffix = {"json": ".json", "raster": ".exr", "rasters": "", "picture": ".png", "page": ".html"}[self.kind]
+        suffix = {"records": "", "json": ".json", "raster": ".exr", "rasters": "", "picture": ".png", "page": ".html"}[self.kind]
         return self.name + suffix
 
 
@@ -35,7 +35,7 @@ class Stage:
     params: type
     inputs: dict[str, Artifact]
     outputs: dict[str, Artifact]
-    impure: bool = False  # reads files outside the build (ingest), so it is asked every time
+    impure: bool = False  # takes (capture_folder, scene_file, params): reads outside the build, so asked every time
 
 
 class Graph:
@@ -45,12 +45,12 @@ class Graph:
         self.stages = list(stages)
         self.producer: dict[str, Stage] = {}
         for stage in self.stages:
-            names = [*stage.inputs, "params"]
+            names = ["capture_folder", "scene_file", "params"] if stage.impure else [*stage.inputs, "params"]
             arguments = list(inspect.signature(stage.compute).parameters)
             if arguments != names:
                 raise TypeError(f"{stage.name}: compute takes {arguments}, the stage declares {names}")
             for artifact in stage.inputs.values():
-                if artifact.name not in self.producer:
+                if artifact.kind != "records" and artifact.name not in self.producer:
                     raise TypeError(f"{stage.name}: reads {artifact.name}, which no earlier stage writes")
             for artifact in stage.outputs.values():
                 if artifact.name in self.producer:
@@ -62,6 +62,8 @@ class Graph:
 
     def parents(self, stage: Stage) -> list[Stage]:
         """Stages whose outputs this one reads, in order, without repeats."""
+        if any(artifact.kind == "records" for artifact in stage.inputs.values()):
+            return self.stages[: self.stages.index(stage)]
         names = {self.producer[artifact.name].name for artifact in stage.inputs.values()}
         return [parent for parent in self.stages if parent.name in names]
 

@@ -1,0 +1,67 @@
+# insitu: `make demo` shows what it does, `make test` shows that it works, `make help` lists the rest.
+MAKEFLAGS += --warn-undefined-variables --no-builtin-rules
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DELETE_ON_ERROR:
+.SUFFIXES:
+.DEFAULT_GOAL := help
+
+CAPTURE ?= sample_captures/desk
+SCENE ?=
+QUALITY ?=
+OUT ?= build/$(notdir $(CAPTURE:/=))
+PYTHON ?= python3
+VENV := .venv
+READY := $(VENV)/.ready
+INSITU := $(VENV)/bin/insitu
+CAPTURE_FILES = $(shell find $(CAPTURE) -type f 2>/dev/null)
+
+-include build/stages.mk
+
+help: $(READY)  ## list the targets
+	@grep -hE '^[a-z-]+:.*  ## ' $(MAKEFILE_LIST) | sed -E 's/:.*  ## /\t/' | expand -t 16
+
+# Debian's python3 comes without ensurepip: the environment is made without pip, and the system's pip fills it.
+$(READY): requirements.lock pyproject.toml
+	@test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
+	$(PYTHON) -m pip --python $(VENV)/bin/python install --quiet --require-hashes -r requirements.lock
+	$(PYTHON) -m pip --python $(VENV)/bin/python install --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+setup: $(READY)  ## create .venv with everything in it
+
+build/stages.mk: $(READY) stages/order.py $(wildcard stages/*.py) $(wildcard pipeline/*/*.py)
+	@mkdir -p build && $(INSITU) rules > $@.part && mv $@.part $@
+
+$(OUT)/settings.json: FORCE | $(READY)
+	@$(INSITU) settings $(CAPTURE) --out $(OUT) $(if $(QUALITY),--quality $(QUALITY)) $(if $(SCENE),--scene $(SCENE))
+
+demo: $(OUT)/report/record.json  ## composite the bundled capture and say how good it is
+	@$(INSITU) summary $(CAPTURE) --out $(OUT)
+
+all: $(OUT)/report/record.json  ## every stage of CAPTURE
+
+test: $(READY)  ## run the tests
+	$(VENV)/bin/python -m pytest
+
+test-all: $(READY)  ## run the slow tests too
+	$(VENV)/bin/python -m pytest -m 'slow or not slow'
+
+check: $(READY)  ## lint and type check
+	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/mypy
+
+docs: $(READY)  ## regenerate stages/README.md
+	@$(INSITU) docs > stages/README.md
+
+verify: $(READY)  ## recompute the digests of a build
+	@$(INSITU) verify $(CAPTURE) --out $(OUT)
+
+lock: $(READY)  ## pin the dependencies with hashes
+	$(VENV)/bin/pip-compile --quiet --extra dev --generate-hashes --no-emit-index-url --no-emit-find-links --allow-unsafe \
+		--strip-extras --output-file requirements.lock pyproject.toml
+
+clean:  ## remove what was built
+	rm -rf build
+
+FORCE:
+.PHONY: help setup demo all test test-all check docs verify lock clean FORCE

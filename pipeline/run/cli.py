@@ -1,0 +1,175 @@
+"""The ``insitu`` command: parses, calls, prints. The one place that turns an error into one line and an exit code.
+
+Imports nothing heavy at the top, so that ``--help``, ``--version`` and a refused manifest answer at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pipeline
+from pipeline.run import closure
+from pipeline.run.errors import InsituError, ManifestError
+
+EPILOG = "Exit codes: 0 done, 2 manifest or switch, 3 photographs, 4 build files, 5 external tool, 6 no unique answer."
+
+
+def stage_names() -> tuple[str, ...]:
+    """Stages in reading order."""
+    from stages.order import NAMES
+
+    return NAMES
+
+
+def summary_line(module: str) -> str:
+    """First docstring line of a module, read without importing it."""
+    path = closure.path_of(module)
+    return closure.docstring(path).partition("\n")[0] if path else ""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line: one verb per stage and a few that join them."""
+    parser = argparse.ArgumentParser(prog="insitu", description="Put objects into a photograph.", epilog=EPILOG)
+    parser.add_argument("--version", action="version", version=f"insitu {pipeline.__version__}")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(name: str, text: str, capture: bool = True) -> argparse.ArgumentParser:
+        sub = verbs.add_parser(name, help=text, description=text)
+        if capture:
+            sub.add_argument("capture", type=Path, help="capture folder, or its capture.toml")
+            sub.add_argument("--out", type=Path, help="build folder (default: build/<capture name>)")
+        return sub
+
+    def asking(sub: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        sub.add_argument("--scene", type=Path, help="scene.toml (default: the one beside capture.toml)")
+        sub.add_argument("--quality", choices=["draft", "preview", "final"], help="preset (default: scene.toml's)")
+        sub.add_argument("--set", action="append", default=[], metavar="STAGE.KNOB=VALUE", help="set one knob")
+        return sub
+
+    run = asking(verb("run", "run every stage that is not up to date, in one process"))
+    run.add_argument("--upto", help="last stage to run")
+    asking(verb("settings", "resolve what a run is asked into settings.json"))
+    verb("summary", "print results, errors against truth and seconds per stage")
+    verb("verify", "recompute the digest of every file of a build")
+    for name in stage_names():
+        sub = verb(name, summary_line(f"stages.{name}"))
+        sub.set_defaults(stage=name)
+        if name == "evaluate":
+            _scoring(sub)
+    simulate = verb("simulate", summary_line("stages.simulate"), capture=False)
+    simulate.add_argument("scene", type=Path, help="SCENE.toml")
+    simulate.add_argument("folder", type=Path, help="folder of the new capture")
+    verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
+    verb("rules", "print the generated make rules", capture=False)
+    verb("docs", "print the table of stages, artifacts and knobs", capture=False)
+    return parser
+
+
+def _scoring(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--composite", type=Path, help="score this EXR instead of the build's composite")
+    sub.add_argument("--plate", type=Path, help="the developed plate that belongs to it (default: the build's)")
+    sub.add_argument("--probe", type=Path, help="score this lat-long EXR too")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    logging.basicConfig(format="%(levelname)s %(message)s", level=logging.WARNING, stream=sys.stderr)
+    args = build_parser().parse_args(argv)
+    try:
+        return dispatch(args)
+    except InsituError as error:
+        for line in str(error).splitlines() or [repr(error)]:
+            say(f"insitu: {line}", stream=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        say("insitu: interrupted; finished stages are kept, run the same command to go on", stream=sys.stderr)
+        return 130
+
+
+def say(text: str, stream: Any = None) -> None:
+    """Print a line at once."""
+    (stream or sys.stdout).write(text + "\n")
+    (stream or sys.stdout).flush()
+
+
+def dispatch(args: argparse.Namespace) -> int:
+    """Do what was asked."""
+    if args.verb == "simulate":
+        from stages.simulate import simulate
+
+        simulate(args.scene, args.folder, say)
+        return 0
+    if args.verb == "doctor":
+        from pipeline.run.doctor import examine
+
+        lines, healthy = examine()
+        say("\n".join(lines))
+        return 0 if healthy else 5
+    if args.verb in ("rules", "docs"):
+        from pipeline.run import derive
+        from stages.knobs import KNOBS
+        from stages.order import graph
+
+        say(derive.rules(graph()) if args.verb == "rules" else derive.table(graph(), KNOBS))
+        return 0
+    if args.verb == "evaluate" and args.composite:
+        from stages.evaluate import score_files
+
+        scores = score_files(args.capture, args.composite, args.plate, args.probe, out_of(args))
+        say(json.dumps(scores, indent=1))
+        return 0
+    return with_build(args)
+
+
+def out_of(args: argparse.Namespace) -> Path:
+    """The build folder: what was given, else build/<name of the capture>."""
+    from pipeline.run.manifest import load_capture
+
+    return args.out or Path("build") / load_capture(args.capture)[0].name
+
+
+def with_build(args: argparse.Namespace) -> int:
+    """Verbs that need a build folder."""
+    from pipeline.run import settings as asked
+    from stages.knobs import KNOBS, PRESETS
+
+    resolves = args.verb in ("run", "settings")
+    out = out_of(args)
+    if resolves or not (out / "settings.json").exists():
+        chosen = asked.resolve(
+            args.capture, getattr(args, "scene", None), getattr(args, "quality", None), getattr(args, "set", []), KNOBS, PRESETS
+        )
+        asked.save(chosen, out)
+    if args.verb == "settings":
+        return 0
+    os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
+    from pipeline.run.derive import print_summary
+    from pipeline.run.runner import Build
+    from stages.order import graph
+
+    build = Build(graph(), out, asked.load(out), KNOBS)
+    if args.verb == "summary":
+        say(print_summary(build))
+        return 0
+    if args.verb == "verify":
+        problems = build.verify()
+        say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
+        return 4 if problems else 0
+    names = stage_names()
+    if args.verb == "run":
+        last = args.upto or names[-1]
+        if last not in names:
+            raise ManifestError(f"--upto: is {last!r}; expected one of {', '.join(names)}")
+        stages = build.graph.upto(last)
+    else:
+        stages = [build.graph[args.stage]]
+    build.run_all(stages, lambda name, outcome, seconds: say(f"{name:<12} {outcome:<6} {seconds:7.2f} s"))
+    if args.verb == "run" and last == names[-1]:
+        say(print_summary(build))
+    return 0

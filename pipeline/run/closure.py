@@ -1,0 +1,61 @@
+"""Which files of this project a module needs: read from its import statements, without importing it.
+
+The set is both a stage's Make prerequisites and its code digest, so that editing a room re-runs that room only.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+# Declarations and plumbing: what a stage declares enters its record by value, so their edits re-run nothing.
+PLUMBING = {"pipeline.run.artifacts", "pipeline.run.stage", "stages.knobs", "pipeline.run.errors"}
+
+
+def path_of(module: str) -> Path | None:
+    """File of a module of this project; None for other modules and for packages."""
+    path = ROOT / (module.replace(".", "/") + ".py")
+    return path if module.split(".")[0] in ("pipeline", "stages") and path.is_file() else None
+
+
+@functools.cache
+def imports(module: str) -> frozenset[str]:
+    """Modules of this project that one module imports, at any depth of its code."""
+    path = path_of(module)
+    if path is None:
+        return frozenset()
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(name for name in found if path_of(name) and name not in PLUMBING)
+
+
+@functools.cache
+def closure(module: str) -> tuple[Path, ...]:
+    """Files that a module needs, itself included, sorted."""
+    seen, todo = set(), [module]
+    while todo:
+        name = todo.pop()
+        if name not in seen:
+            seen.add(name)
+            todo += imports(name)
+    return tuple(sorted(path for name in seen if (path := path_of(name))))
+
+
+def digest(module: str) -> str:
+    """sha256 over the contents of the closure."""
+    total = hashlib.sha256()
+    for path in closure(module):
+        total.update(path.read_bytes())
+    return total.hexdigest()
+
+
+def docstring(path: Path) -> str:
+    """Module docstring of a file, without importing it."""
+    return ast.get_docstring(ast.parse(path.read_text())) or ""

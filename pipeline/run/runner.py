@@ -1,0 +1,183 @@
+"""Read, compute, check, write, record: the one way from files to files.
+
+Make decides what to ask by time; this decides what to do by digest of inputs, parameters, code and library versions.
+``record.json`` is written last, so an interrupted stage leaves none and runs again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from pipeline.run import closure, formats
+from pipeline.run.errors import ArtifactError
+from pipeline.run.settings import Settings
+from pipeline.run.stage import Artifact, Graph, Stage
+from pipeline.types import Raster, Result
+
+LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "mitsuba", "OpenEXR", "rawpy")
+log = logging.getLogger("insitu")
+
+
+@dataclass
+class Build:
+    """One capture's build folder, with what this process already holds in memory."""
+
+    graph: Graph
+    out: Path
+    settings: Settings
+    knobs: dict[str, Any]
+    memory: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=lambda: {n: importlib.metadata.version(n) for n in LIBRARIES})
+
+    def record(self, name: str) -> dict[str, Any] | None:
+        """The record of a stage, or None when it has not run."""
+        path = self.out / name / "record.json"
+        try:
+            return json.loads(path.read_bytes())
+        except (FileNotFoundError, json.JSONDecodeError):
+            return None
+
+    def value(self, artifact: Artifact) -> Any:
+        """An input, from memory or from disk."""
+        if artifact.name not in self.memory:
+            self.memory[artifact.name] = formats.read(self.out / self.graph.producer[artifact.name].name, artifact)
+        return self.memory[artifact.name]
+
+    def input_digests(self, stage: Stage) -> dict[str, str]:
+        """Digest of every input as its producer recorded it. Raises ArtifactError when a producer has not run."""
+        digests = {}
+        for argument, artifact in stage.inputs.items():
+            if artifact.kind == "records":
+                digests[argument] = _digest_of(self.records_before(stage, timing=False))
+                continue
+            producer = self.graph.producer[artifact.name].name
+            record = self.record(producer)
+            if record is None:
+                raise ArtifactError(f"{self.out / producer}: has not run; needed by {stage.name}; run insitu {producer}")
+            digests[argument] = record["outputs"][artifact.name]
+        return digests
+
+    def records_before(self, stage: Stage, timing: bool = True) -> dict[str, Any]:
+        """numbers, warnings, evidence, params (and seconds) of the stages before this one."""
+        keys = ["numbers", "warnings", "evidence", "params", "versions", *(["seconds"] if timing else [])]
+        records = {parent.name: self.record(parent.name) or {} for parent in self.graph.parents(stage)}
+        return {name: {key: record.get(key) for key in keys} for name, record in records.items()}
+
+    def run(self, stage: Stage) -> str:
+        """Run one stage unless its record shows that nothing changed; ``"fresh"`` or ``"ran"``."""
+        wanted = {
+            "stage": stage.name,
+            "inputs": self.input_digests(stage),
+            "params": self.settings.params[stage.name],
+            "code": closure.digest(stage.compute.__module__),
+            "versions": self.versions,
+        }
+        old = self.record(stage.name)
+        if old and not stage.impure and self._is_fresh(stage, wanted, old):
+            os.utime(self.out / stage.name / "record.json")
+            return "fresh"
+        start, cpu = time.perf_counter(), time.process_time()
+        result = self._compute(stage)
+        if set(result.outputs) != set(stage.outputs):
+            raise TypeError(f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}")
+        outputs = {}
+        for key, artifact in stage.outputs.items():
+            value = settle(artifact, result.outputs[key])
+            self.memory[artifact.name] = value
+            outputs[artifact.name] = formats.digest(formats.write(self.out / stage.name, artifact, value))
+        seconds = {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
+        measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
+        changed = old is None or old.get("outputs") != outputs
+        record = wanted | {"outputs": outputs} | seconds | measured
+        formats.write_bytes(self.out / stage.name / "record.json", _json(record))
+        for warning in result.warnings:
+            log.warning("%s: %s", stage.name, warning)
+        return "ran" if changed else "same"
+
+    def _is_fresh(self, stage: Stage, wanted: dict[str, Any], old: dict[str, Any]) -> bool:
+        if any(old.get(key) != json.loads(_json(value)) for key, value in wanted.items()):
+            return False
+        return all((self.out / stage.name / artifact.filename).exists() for artifact in stage.outputs.values())
+
+    def _compute(self, stage: Stage) -> Result:
+        params = self.knobs[stage.name].model_validate(self.settings.params[stage.name])
+        if stage.impure:
+            scene = Path(self.settings.scene) if self.settings.scene else None
+            return stage.compute(Path(self.settings.capture), scene, params)
+        inputs = {
+            argument: self.records_before(stage) if artifact.kind == "records" else self.value(artifact)
+            for argument, artifact in stage.inputs.items()
+        }
+        return stage.compute(**inputs, params=params)
+
+    def run_all(self, stages: Iterable[Stage], report: Callable[[str, str, float], None]) -> None:
+        """Run stages in order; ``report(name, outcome, seconds)`` after each."""
+        for stage in stages:
+            start = time.perf_counter()
+            outcome = self.run(stage)
+            report(stage.name, outcome, time.perf_counter() - start)
+
+    def verify(self) -> list[str]:
+        """Problems found by recomputing the digest of every output on disk."""
+        problems = []
+        for stage in self.graph.stages:
+            record = self.record(stage.name)
+            if record is None:
+                problems.append(f"{stage.name}: has not run")
+                continue
+            for artifact in stage.outputs.values():
+                path = self.out / stage.name / artifact.filename
+                if not path.exists():
+                    problems.append(f"{path}: missing; delete {stage.name}/record.json and run again")
+                elif formats.digest(path) != record["outputs"][artifact.name]:
+                    problems.append(f"{path}: differs from what {stage.name} wrote")
+        return problems
+
+
+def settle(artifact: Artifact, value: Any) -> Any:
+    """The value exactly as a later process would read it back, so that one process and many give the same bytes."""
+    if artifact.kind == "json":
+        adapter = TypeAdapter(artifact.type)
+        return adapter.validate_json(adapter.dump_json(value))
+    if artifact.kind == "raster":
+        return settle_raster(value)
+    if artifact.kind == "rasters":
+        return {name: settle_raster(raster) for name, raster in sorted(value.items())}
+    return value
+
+
+def settle_raster(raster: Raster) -> Raster:
+    """Channels as float32 or uint32, contiguous."""
+    channels = {
+        name: np.ascontiguousarray(values, np.uint32 if values.dtype.kind in "ub" else np.float32)
+        for name, values in raster.channels.items()
+    }
+    return Raster(channels, raster.space, raster.attributes)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} does not go into a record")
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, indent=1, default=_plain, sort_keys=True).encode() + b"\n"
+
+
+def _digest_of(value: Any) -> str:
+    return hashlib.sha256(_json(value)).hexdigest()
