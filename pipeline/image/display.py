@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.image import colour
 from pipeline.run.errors import ManifestError
 
 BUILTIN_CONFIG = "ocio://cg-config-v4.0.0_aces-v2.0_ocio-v2.5"
@@ -21,8 +22,6 @@ VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 MID_GREY = 0.18
 THREADS = 2  # the processor releases the GIL: two row blocks take half the time of one
 
-# Y row of the AP1 to XYZ matrix (SMPTE ST 2065-1 primaries of ACEScg, white at D60 of ACES).
-AP1_LUMINANCE = np.array([0.27222872, 0.67408177, 0.05368952])
 # AP1 -> AP0, S-2014-004 (ACEScg), appendix A; only for configs that know ACES2065-1 and not ACEScg.
 AP0_FROM_AP1 = np.array(
     [
@@ -50,9 +49,9 @@ def auto_exposure(rgb: np.ndarray) -> float:
 
     Only finite, positive pixels count; 0 when there are none.
     """
-    luminance = rgb.reshape(-1, 3) @ AP1_LUMINANCE
-    luminance = luminance[np.isfinite(luminance) & (luminance > 0)]
-    return float(np.log2(MID_GREY / np.median(luminance))) if luminance.size else 0.0
+    values = colour.luminance(rgb).ravel()
+    values = values[np.isfinite(values) & (values > 0)]
+    return float(np.log2(MID_GREY / np.median(values))) if values.size else 0.0
 
 
 def display_transform(
