@@ -79,8 +79,8 @@ def undistort(distortion: np.ndarray, distorted: np.ndarray) -> np.ndarray:
     if outside.any():
         first = distorted[np.argmax(outside)]
         raise NumericalError(
-            f"lens: {int(outside.sum())} of {outside.size} positions (first: {first[0]:.4f}, {first[1]:.4f} normalised) "
-            "lie outside the range of the distortion model, needed all inside; calibrate with the board near the corners"
+            f"lens: {int(outside.sum())} of {outside.size} positions (first at {first[0]:.4f}, {first[1]:.4f} / Z) "
+            "are beyond the distortion model, needed all inside; calibrate with the board near the corners"
         )
     return xy
 

@@ -1,0 +1,151 @@
+"""Joint adjustment of one lens and the poses of its board photographs, with the lens's covariance.
+
+Gauss-Newton with Levenberg's damping on the reprojection error; the poses are eliminated by Schur's complement. Which
+of (fx fy cx cy k1 k2 p1 p2 k3) are free is a matrix, so that one focal length for both axes is a column, not a case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.camera.resection import residuals_and_jacobian
+from pipeline.camera.rigid import perturb
+from pipeline.run.errors import NumericalError
+from pipeline.types import Camera
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The lens with covariance, poses (4, 4) and residuals (N_i, 2) px of each photograph, sigma of a coordinate."""
+
+    camera: Camera
+    poses: list[np.ndarray]
+    residuals_px: list[np.ndarray]
+    sigma_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance over all corners."""
+        return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(-1).mean()))
+
+
+def free_columns(terms: tuple[str, ...], one_focal: bool) -> np.ndarray:
+    """(9, K) matrix of what moves: the focal length(s), the principal point and the named distortion terms."""
+    columns = [np.eye(9)[:, [0, 1]].sum(1)] if one_focal else [np.eye(9)[:, 0], np.eye(9)[:, 1]]
+    return np.stack([*columns, *(np.eye(9)[:, LENS.index(term)] for term in ("cx", "cy", *terms))], -1)
+
+
+def lens_vector(camera: Camera) -> np.ndarray:
+    """(9,) in the order of `LENS`."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def with_lens(camera: Camera, lens: np.ndarray) -> Camera:
+    """The camera with other numbers (9,)."""
+    fx, fy, cx, cy = (float(v) for v in lens[:4])
+    return camera.model_copy(update={"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": np.array(lens[4:])})
+
+
+def adjust(
+    camera: Camera, poses: list[np.ndarray], world_m: list[np.ndarray], px: list[np.ndarray], free: np.ndarray
+) -> Adjustment:
+    """Least squares from a start. Terms outside ``free`` keep their start value.
+
+    Raises NumericalError when the photographs do not fix the free terms.
+    """
+    damping, cost = 1e-6, np.inf
+    lens, state = lens_vector(camera), list(poses)
+    system = _normal_equations(camera, state, world_m, px, free)
+    for _ in range(60):
+        lens_step, pose_steps = _step(*system[:3], system[3], damping)
+        candidate = with_lens(camera, lens + free @ lens_step)
+        moved = [perturb(pose, step) for pose, step in zip(state, pose_steps, strict=True)]
+        trial = _normal_equations(candidate, moved, world_m, px, free)
+        cost = system[4]
+        if np.isfinite(trial[4]) and trial[4] <= cost:
+            camera, state, system, lens = candidate, moved, trial, lens_vector(candidate)
+            damping = max(damping * 0.1, 1e-12)
+            if cost - trial[4] <= 1e-10 * cost + 1e-18:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    return _finish(camera, state, world_m, px, free, system)
+
+
+_System = tuple[np.ndarray, list[np.ndarray], list[np.ndarray], tuple[np.ndarray, list[np.ndarray]], float]
+
+
+def _normal_equations(
+    camera: Camera, poses: list[np.ndarray], world_m: list[np.ndarray], px: list[np.ndarray], free: np.ndarray
+) -> _System:
+    """Blocks of J^T J (lens, lens-pose, pose), the gradients, and the cost (inf when a point leaves the lens)."""
+    lens_lens = np.zeros((free.shape[1], free.shape[1]))
+    lens_gradient = np.zeros(free.shape[1])
+    cross, pose_pose, pose_gradient, cost = [], [], [], 0.0
+    for pose, points, seen in zip(poses, world_m, px, strict=True):
+        residuals, by_pose, by_lens = residuals_and_jacobian(camera, pose, points, seen)
+        flat, lens, r = by_pose.reshape(-1, 6), by_lens.reshape(-1, 9) @ free, residuals.ravel()
+        lens_lens += lens.T @ lens
+        lens_gradient += lens.T @ r
+        cross.append(lens.T @ flat)
+        pose_pose.append(flat.T @ flat)
+        pose_gradient.append(flat.T @ r)
+        cost += float(r @ r)
+    return lens_lens, cross, pose_pose, (lens_gradient, pose_gradient), cost if np.isfinite(cost) else np.inf
+
+
+def _damped(block: np.ndarray, damping: float) -> np.ndarray:
+    return block + damping * np.diag(np.diag(block))
+
+
+def _step(
+    lens_lens: np.ndarray,
+    cross: list[np.ndarray],
+    pose_pose: list[np.ndarray],
+    gradients: tuple[np.ndarray, list[np.ndarray]],
+    damping: float,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Damped step of the lens terms and of every pose."""
+    lens_gradient, pose_gradient = gradients
+    reduced, right = _damped(lens_lens, damping), lens_gradient.copy()
+    solved = []
+    for c, p, g in zip(cross, pose_pose, pose_gradient, strict=True):
+        answer = np.linalg.solve(_damped(p, damping), np.column_stack([c.T, g]))
+        reduced = reduced - c @ answer[:, :-1]
+        right = right - c @ answer[:, -1]
+        solved.append(answer)
+    lens_step = np.linalg.solve(reduced, right)
+    return lens_step, [answer[:, -1] - answer[:, :-1] @ lens_step for answer in solved]
+
+
+def _finish(
+    camera: Camera,
+    poses: list[np.ndarray],
+    world_m: list[np.ndarray],
+    px: list[np.ndarray],
+    free: np.ndarray,
+    system: _System,
+) -> Adjustment:
+    """Residuals and the covariance, scaled by chi2 per degree of freedom."""
+    lens_lens, cross, pose_pose, _, cost = system
+    residuals = [residuals_and_jacobian(camera, *item)[0] for item in zip(poses, world_m, px, strict=True)]
+    reduced = lens_lens - sum(c @ np.linalg.solve(p, c.T) for c, p in zip(cross, pose_pose, strict=True))
+    scale = np.sqrt(np.maximum(np.diag(lens_lens), 1e-300))
+    scaled = reduced / np.outer(scale, scale)
+    if not np.isfinite(cost) or not np.isfinite(scaled).all() or np.linalg.eigvalsh(scaled)[0] < 1e-12:
+        raise NumericalError(
+            f"calibrate: {len(poses)} board photographs do not fix the lens, needed different tilts; take some "
+            "with the board tilted 30 to 45 degrees in several directions"
+        )
+    freedom = max(2 * sum(len(r) for r in residuals) - free.shape[1] - 6 * len(poses), 1)
+    sigma = float(np.sqrt(cost / freedom))
+    covariance = free @ (sigma**2 * np.linalg.inv(scaled) / np.outer(scale, scale)) @ free.T
+    rms = float(np.sqrt(cost / sum(len(r) for r in residuals)))
+    done = camera.model_copy(update={"covariance": (covariance + covariance.T) / 2, "rms_px": rms})
+    return Adjustment(done, poses, residuals, sigma)

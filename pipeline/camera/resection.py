@@ -1,0 +1,185 @@
+"""Pose of one calibrated photograph from points of known position: robust refinement, covariance, planar ambiguity.
+
+Minimises the reprojection error through the lens (no undistorted copies of the data) by Levenberg-Marquardt with
+analytic derivatives. A plane has two poses that explain it almost equally well (Collins and Bartoli 2014, IPPE); both
+are refined and compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.camera.lens import project_jacobians, unproject
+from pipeline.camera.rigid import camera_points, difference, perturb, plane_frame
+from pipeline.conventions import invert_rigid
+from pipeline.run.errors import NumericalError
+from pipeline.types import Camera
+
+HUBER = 2.0  # residuals beyond this many sigma lose weight while searching
+GATE = 5.0  # and beyond this many are left out of the final fit
+GATE_POINTS = 8  # with fewer points an outlier cannot be told from a bad pose
+FLAT = 1e-3  # points whose least extent is below this fraction of the largest are one plane
+
+
+@dataclass(frozen=True)
+class Resection:
+    """A refined pose (4, 4), covariances (6, 6), covariance with the lens (6, 9), residuals (N, 2) px."""
+
+    world_from_camera: np.ndarray
+    covariance: np.ndarray
+    noise_covariance: np.ndarray  # the part of it that the corners' noise makes
+    lens_covariance: np.ndarray
+    residuals_px: np.ndarray
+    kept: np.ndarray  # (N,) bool
+    sigma_px: float  # uncertainty of one coordinate that the covariance assumes
+    chi2: float  # of the kept residuals in units of the stated corner sigma
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of the kept points."""
+        return float(np.sqrt((self.residuals_px[self.kept] ** 2).sum(-1).mean()))
+
+
+def residuals_and_jacobian(
+    camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals (N, 2) measured - predicted, derivative of the prediction by the pose (N, 2, 6) and lens (N, 2, 9)."""
+    points, by_pose = camera_points(pose, world_points)
+    predicted, by_point, by_lens = project_jacobians(camera, points)
+    return px - predicted, by_point @ by_pose, by_lens
+
+
+def robust_scale(residuals: np.ndarray) -> float:
+    """Standard deviation of one coordinate from the median absolute residual."""
+    return float(1.4826 * np.median(np.abs(residuals)))
+
+
+def minimise(
+    camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray, huber_px: float = np.inf
+) -> np.ndarray:
+    """Levenberg-Marquardt on the pose (4, 4), Huber cost. Returns the pose; a start that fits nothing comes back."""
+
+    def evaluate(candidate: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        residuals, jacobian, _ = residuals_and_jacobian(camera, candidate, world_points, px)
+        size = np.maximum(np.hypot(residuals[:, 0], residuals[:, 1]), 1e-300)
+        weight = np.minimum(1.0, huber_px / size)
+        cost = float((weight * (2 - weight) * size**2).sum())  # Huber's rho, doubled
+        return (cost if np.isfinite(cost) else np.inf), weight, residuals, jacobian
+
+    damping = 1e-6
+    cost, weight, residuals, jacobian = evaluate(pose)
+    if not np.isfinite(cost):
+        return pose
+    for _ in range(100):
+        flat, measured = (weight[:, None, None] * jacobian).reshape(-1, 6), residuals.ravel()
+        normal = flat.T @ jacobian.reshape(-1, 6)
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), flat.T @ measured)
+        candidate = perturb(pose, step)
+        new_cost, *rest = evaluate(candidate)
+        if new_cost <= cost:
+            done = cost - new_cost <= 1e-12 * cost + 1e-18
+            pose, cost, damping = candidate, new_cost, max(damping * 0.1, 1e-12)
+            weight, residuals, jacobian = rest
+            if done:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    return pose
+
+
+def refine(
+    camera: Camera,
+    start: np.ndarray,
+    world_points: np.ndarray,
+    px: np.ndarray,
+    sigma_px: float,
+    kept: np.ndarray | None = None,
+) -> Resection:
+    """Refine a pose (4, 4) on points (N, 3) and pixels (N, 2); without ``kept`` outliers are found here.
+
+    The covariance assumes the larger of ``sigma_px`` and what the residuals show, independent between points, and
+    includes the camera's own covariance. Raises NumericalError when the points do not fix the pose.
+    """
+    pose = start
+    if kept is None:
+        kept = np.ones(len(px), bool)
+        if len(px) >= GATE_POINTS:
+            pose = minimise(camera, start, world_points, px, 10 * HUBER * sigma_px)
+            for _ in range(2):
+                scale = max(sigma_px, robust_scale(residuals_and_jacobian(camera, pose, world_points, px)[0]))
+                pose = minimise(camera, pose, world_points, px, HUBER * scale)
+            residuals = residuals_and_jacobian(camera, pose, world_points, px)[0]
+            kept = np.hypot(*residuals.T) <= GATE * max(sigma_px, robust_scale(residuals))
+    pose = minimise(camera, pose, world_points[kept], px[kept])
+    residuals, jacobian, by_lens = residuals_and_jacobian(camera, pose, world_points, px)
+    squares = float((residuals[kept] ** 2).sum())
+    sigma = max(sigma_px, np.sqrt(squares / max(2 * kept.sum() - 6, 1)))
+    flat, lens = jacobian[kept].reshape(-1, 6), by_lens[kept].reshape(-1, 9)
+    normal = flat.T @ flat
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / np.outer(size, size)
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e13:
+        raise NumericalError(
+            f"pose: {int(kept.sum())} points do not fix six unknowns (collinear or too few), needed points spread over "
+            "an area; show more of the board or add points"
+        )
+    inverse = np.linalg.inv(scaled) / np.outer(size, size)
+    lens_covariance = -inverse @ flat.T @ lens @ camera.covariance
+    noise = sigma**2 * (inverse + inverse.T) / 2
+    carried = -lens_covariance @ lens.T @ flat @ inverse
+    covariance = noise + (carried + carried.T) / 2
+    return Resection(pose, covariance, noise, lens_covariance, residuals, kept, float(sigma), squares / sigma_px**2)
+
+
+def planar_candidates(camera: Camera, world_points: np.ndarray, px: np.ndarray) -> list[np.ndarray]:
+    """Both analytic poses (4, 4) ``world_from_camera`` of coplanar points, best first."""
+    from pipeline.camera.opencv_bridge import planar_poses
+
+    world_from_plane, _ = plane_frame(world_points)
+    flat = (world_points - world_from_plane[:3, 3]) @ world_from_plane[:3, :3]
+    return [world_from_plane @ invert_rigid(pose) for pose in planar_poses(flat[:, :2], unproject(camera, px))]
+
+
+def is_planar(world_points: np.ndarray) -> bool:
+    """Whether the points lie in one plane as far as their pose is concerned. Raises NumericalError when collinear."""
+    _, extents = plane_frame(world_points)
+    if len(world_points) < 4 or extents[1] < 1e-3 * extents[0]:
+        raise NumericalError(
+            f"pose: {len(world_points)} points on a line or fewer than 4, needed 4 spread over an area; add points"
+        )
+    return bool(extents[2] < FLAT * extents[0])
+
+
+def resect_plane(
+    camera: Camera, world_points: np.ndarray, px: np.ndarray, sigma_px: float
+) -> tuple[Resection, Resection | None, float]:
+    """Best pose of coplanar points, the second one (None when both starts meet), and the ambiguity.
+
+    The ambiguity is chi2 of the second over the larger of chi2 of the first and its degrees of freedom, so that a lucky
+    fit of few points does not look decisive. Candidates nearer to each other than their own uncertainty are one pose.
+    """
+    candidates = [
+        refine(camera, start, world_points, px, sigma_px) for start in planar_candidates(camera, world_points, px)
+    ]
+    candidates.sort(key=lambda c: robust_cost(c.residuals_px, sigma_px))
+    best = candidates[0]
+    if len(candidates) == 1:
+        return best, None, np.inf
+    second = refine(camera, candidates[1].world_from_camera, world_points, px, sigma_px, best.kept)
+    if second.chi2 < best.chi2:
+        best, second = second, refine(camera, best.world_from_camera, world_points, px, sigma_px, best.kept)
+    apart = difference(second.world_from_camera, best.world_from_camera)
+    if apart @ np.linalg.solve(best.covariance, apart) < 1:
+        return best, None, np.inf
+    freedom = max(2 * int(best.kept.sum()) - 6, 1)
+    return best, second, float(second.chi2 / max(best.chi2, freedom))
+
+
+def robust_cost(residuals: np.ndarray, sigma_px: float) -> float:
+    """Sum of squared distances in sigma, each bounded by the gate, so that outliers do not choose the branch."""
+    squares = (residuals**2).sum(-1) / sigma_px**2
+    return float(np.where(np.isfinite(squares), np.minimum(squares, GATE**2), GATE**2).sum())

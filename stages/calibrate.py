@@ -1,0 +1,272 @@
+"""Intrinsics and distortion from board photographs, with covariance; the distortion model is chosen by held-out error.
+
+Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
+(Gauss-Newton, poses eliminated). Models none, k1, k1 k2, and Brown's five are tried, then separate fx and fy; a richer one is taken
+only where photographs it was not fitted to improve by more than three standard errors. Covariance: inverse normal
+matrix of the chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all photographs; a flat
+board; terms left out have no variance, so the evidence says what they could cost.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
+from pipeline.camera.lens import project, unproject
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration, read_grey
+from pipeline.camera.resection import refine, robust_scale
+from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS
+from pipeline.run.errors import CaptureError, ManifestError, NumericalError
+from pipeline.run.stage import Stage
+from pipeline.types import Camera, Result
+from stages import knobs
+
+LADDER: tuple[tuple[str, ...], ...] = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2", "k3"))
+FEWEST_CORNERS = 8  # of a photograph that is used
+FEWEST_PHOTOS = 3
+NEEDED_SIGMAS = 3.0  # improvement of the held-out error that buys a richer model
+GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
+CORNER_SIGMA_PX = 0.1
+TILT_DEG = 10.0  # boards all nearer than this to parallel to the sensor do not separate focal length from distance
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Corners of the usable photographs: file names, world points (N_i, 3) and pixels (N_i, 2)."""
+
+    files: list[str]
+    world_m: list[np.ndarray]
+    px: list[np.ndarray]
+
+    def only(self, chosen: list[int]) -> Photos:
+        """A subset by index."""
+        return Photos(*([values[i] for i in chosen] for values in (self.files, self.world_m, self.px)))  # type: ignore[arg-type]
+
+
+def compute(facts: dict[str, Any], board_photos: list[dict[str, str]], params: knobs.Calibrate) -> Result:
+    """The camera (pixels with the first centre at (0.5, 0.5)), from given numbers or from board photographs."""
+    if facts["camera"].get("given"):
+        camera = given_camera(facts["camera"]["given"])
+        term = {
+            "term": "intrinsics",
+            "modelled": True,
+            "because": "given",
+            "could_cost": "unknown: no covariance given",
+        }
+        return Result({"camera": camera}, {"source": "given"}, [], [term])
+    warnings: list[str] = []
+    photos, size = sight(facts, board_photos, warnings)
+    start, poses = first_calibration(photos.world_m, photos.px, size)
+    photos, poses = drop_bad(start, photos, poses, warnings)
+    chosen, errors, evidence = climb(start, poses, photos)
+    return judge(chosen, photos, errors, evidence, warnings, params)
+
+
+def given_camera(given: dict[str, Any]) -> Camera:
+    """The manifest's numbers as a camera. Raises ManifestError with every problem."""
+    known = {"width", "height", "fx", "fy", "cx", "cy", "distortion"}
+    problems = [f"camera.given.{key}: unknown key" for key in sorted(set(given) - known)]
+    problems += [f"camera.given.{key}: missing; it is required" for key in sorted(known - set(given) - {"distortion"})]
+    distortion = np.ravel(given.get("distortion", []))
+    if len(distortion) > 5:
+        problems.append(f"camera.given.distortion: has {len(distortion)} terms; expected at most 5 (k1 k2 p1 p2 k3)")
+    if problems:
+        raise ManifestError(*problems)
+    numbers = {key: given[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    if min(numbers["width"], numbers["height"], numbers["fx"], numbers["fy"]) <= 0:
+        raise ManifestError(f"camera.given: is {numbers}; expected positive sizes and focal lengths")
+    return Camera(**numbers, distortion=np.pad(distortion, (0, 5 - len(distortion))), source="given")
+
+
+def sight(
+    facts: dict[str, Any], board_photos: list[dict[str, str]], warnings: list[str]
+) -> tuple[Photos, tuple[int, int]]:
+    """Corners of every photograph in which enough are seen, and (width, height)."""
+    root = Path(facts["capture_root"])
+    files = [photo["file"] for photo in board_photos]
+
+    def look(file: str) -> tuple[tuple[int, int], Sightings]:
+        grey = read_grey(root / file)
+        return (grey.shape[1], grey.shape[0]), board_sightings(grey, grey, facts["board"])
+
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # OpenCV releases the GIL
+        found = list(pool.map(look, files))
+    sizes = {size: file for file, (size, _) in zip(files, found, strict=True)}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h} ({file})" for (w, h), file in sizes.items())
+        raise CaptureError(f"calibration photographs: sizes {listed}, needed one size; take out the others")
+    usable = [i for i, (_, seen) in enumerate(found) if len(seen.px) >= FEWEST_CORNERS]
+    for i in sorted(set(range(len(files))) - set(usable)):
+        seen = found[i][1]
+        warnings.append(
+            f"{files[i]}: {len(seen.px)} corners ({seen.markers} markers) found, needed {FEWEST_CORNERS}; left out"
+        )
+    if len(usable) < FEWEST_PHOTOS:
+        raise CaptureError(
+            f"calibration: {len(usable)} of {len(files)} photographs show the board, needed {FEWEST_PHOTOS}; check "
+            "[board] (dictionary, squares, legacy) and photograph the whole board sharply from several tilts"
+        )
+    photos = Photos([files[i] for i in usable], [found[i][1].world_m for i in usable], [found[i][1].px for i in usable])
+    return photos, next(iter(sizes))
+
+
+def drop_bad(
+    start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str]
+) -> tuple[Photos, list[np.ndarray]]:
+    """Leave out single wrong corners, and photographs whose residual is far above the typical one."""
+    fit = fit_model(start, poses, photos, ("k1", "k2"), True)
+    scale = max(robust_scale(np.concatenate(fit.residuals_px)), 0.02)
+    rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
+    limit = GATE * max(float(np.median(rms)), scale)
+    bad = [i for i in range(len(rms)) if rms[i] > limit]
+    for i in bad:
+        warnings.append(f"{photos.files[i]}: residual {rms[i]:.2f} px, others {np.median(rms):.2f} px; left out")
+    rest = [i for i in range(len(rms)) if i not in bad]
+    if len(rest) < FEWEST_PHOTOS:
+        raise CaptureError(
+            f"calibration: {len(rest)} of {len(rms)} photographs agree with one lens, needed {FEWEST_PHOTOS}; is the "
+            "board flat, and focus and zoom the same in all?"
+        )
+    kept = [np.hypot(*fit.residuals_px[i].T) <= GATE * scale * 2 for i in rest]
+    photos = photos.only(rest)
+    world_m = [points[keep] for points, keep in zip(photos.world_m, kept, strict=True)]
+    px = [points[keep] for points, keep in zip(photos.px, kept, strict=True)]
+    return Photos(photos.files, world_m, px), [fit.poses[i] for i in rest]
+
+
+def fit_model(
+    start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...], one_focal: bool
+) -> Adjustment:
+    """Adjust with these distortion terms free and the others zero."""
+    free = free_columns(terms, one_focal)
+    values = lens_vector(start) * (free.sum(1) > 0)
+    if one_focal:
+        values[:2] = values[:2].mean()
+    return adjust(with_lens(start, values), poses, photos.world_m, photos.px, free)
+
+
+def held_out(
+    start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...], one_focal: bool
+) -> np.ndarray:
+    """Mean squared residual (photos,) px^2 of each photograph under a lens fitted to the others (five folds)."""
+    count = len(photos.files)
+    folds = min(5, count)
+    errors = np.full(count, np.inf)
+    for fold in range(folds):
+        train = [i for i in range(count) if i % folds != fold]
+        try:
+            lens = fit_model(start, [poses[i] for i in train], photos.only(train), terms, one_focal).camera
+            for i in range(fold, count, folds):
+                every = np.ones(len(photos.px[i]), bool)
+                seen = refine(lens, poses[i], photos.world_m[i], photos.px[i], CORNER_SIGMA_PX, every)
+                errors[i] = (seen.residuals_px**2).sum(-1).mean()
+        except NumericalError:
+            continue  # too rich for this fold: its error stays infinite and the model is not taken
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def climb(
+    start: Camera, poses: list[np.ndarray], photos: Photos
+) -> tuple[Adjustment, dict[str, float], list[dict[str, Any]]]:
+    """Take richer models while photographs they have not seen say so; with the reason for each step."""
+    terms: tuple[str, ...] = ()
+    one_focal = True
+    best = held_out(start, poses, photos, terms, one_focal)
+    errors = {"none": float(np.sqrt(best.mean()))}
+    steps = [(rung, True) for rung in LADDER[1:]] + [((), False)]
+    evidence = []
+    for rung, tied in steps:
+        tried = (rung, tied) if tied else (terms, False)
+        name = " ".join(rung) if tied else "fx and fy apart"
+        error = held_out(start, poses, photos, *tried)
+        errors[name] = float(np.sqrt(error.mean()))
+        sigmas = improvement(best, error)
+        taken = sigmas > NEEDED_SIGMAS
+        because = f"held-out error {np.sqrt(best.mean()):.4f} -> {errors[name]:.4f} px, {sigmas:+.1f} sigma (needs 3)"
+        entry = {"term": f"lens: {name}", "modelled": taken, "because": because, "could_cost": ""}
+        evidence.append((entry, tried))
+        if taken:
+            best, (terms, one_focal) = error, tried
+    chosen = fit_model(start, poses, photos, terms, one_focal)
+    for entry, tried in evidence:
+        if not entry["modelled"] and np.isfinite(errors[str(entry["term"]).removeprefix("lens: ")]):
+            shift = disagreement(chosen.camera, fit_model(start, poses, photos, *tried).camera)
+            entry["could_cost"] = f"{shift:.3f} px rms over the frame"
+    return chosen, errors, [entry for entry, _ in evidence]
+
+
+def improvement(before: np.ndarray, after: np.ndarray) -> float:
+    """Mean gain of the held-out error over the photographs in its standard errors."""
+    if not np.isfinite(after).all():
+        return -np.inf
+    gain = before - after
+    return float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12))
+
+
+def disagreement(first: Camera, second: Camera) -> float:
+    """Rms distance, px, between where two lenses image the same rays, over the frame."""
+    y, x = np.meshgrid(np.linspace(0, first.height, 13), np.linspace(0, first.width, 17), indexing="ij")
+    px = np.stack([x, y], -1).reshape(-1, 2)
+    try:
+        xy = unproject(first, px)
+    except NumericalError:
+        return np.inf
+    moved = project(second, np.concatenate([xy, np.ones((len(xy), 1))], -1)) - px
+    finite = np.isfinite(moved).all(-1)
+    return float(np.sqrt((moved[finite] ** 2).sum(-1).mean())) if finite.any() else np.inf
+
+
+def judge(
+    chosen: Adjustment,
+    photos: Photos,
+    errors: dict[str, float],
+    evidence: list[dict[str, Any]],
+    warnings: list[str],
+    params: knobs.Calibrate,
+) -> Result:
+    """Refuse what does not determine a lens, warn about what hardly does, and report."""
+    camera = chosen.camera
+    if chosen.rms_px > params.max_rms_px:
+        raise NumericalError(
+            f"calibrate: residual {chosen.rms_px:.2f} px, needed {params.max_rms_px} px; is the board flat, are square_m "
+            "and squares right, and focus and zoom the same in all photographs?"
+        )
+    sigma = np.sqrt(np.diag(camera.covariance))
+    relative = float(sigma[0] / camera.fx)
+    # The board's normal is world +Y; its angle to the optical axis is the tilt.
+    tilts = np.degrees([np.arccos(min(1.0, abs(pose[1, 2]))) for pose in chosen.poses])
+    if tilts.max() < TILT_DEG or relative > 0.01:
+        text = (
+            f"calibrate: board tilts reach {tilts.max():.0f} deg and the focal length is known to {relative:.2%}, needed "
+            "tilts of 30 deg and 1 %; add photographs with the board tilted 30 to 45 degrees in several directions"
+        )
+        if relative > 0.05:
+            raise NumericalError(text)
+        warnings.append(text)
+    everything = np.concatenate(photos.px)
+    span = (np.ptp(everything, axis=0) / (camera.width, camera.height)).tolist()
+    if min(span) < 0.6:
+        warnings.append(
+            f"calibrate: corners span {span[0]:.0%} by {span[1]:.0%} of the frame, needed 60 %; distortion outside is "
+            "extrapolated; add photographs with the board near the edges"
+        )
+    numbers = {
+        "source": camera.source, "rms_px": chosen.rms_px, "corner_sigma_px": chosen.sigma_px,
+        "photos": len(photos.files), "corners": len(everything), "held_out_rms_px": errors,
+        "focal_sigma_rel": relative, "principal_point_sigma_px": sigma[2:4].tolist(),
+        "tilt_max_deg": float(tilts.max()), "frame_span": span,
+        "photo_rms_px": {
+            file: float(np.sqrt((r**2).sum(-1).mean()))
+            for file, r in zip(photos.files, chosen.residuals_px, strict=True)
+        },
+    }  # fmt: skip
+    return Result({"camera": camera}, numbers, warnings, evidence)
+
+
+STAGE = Stage("calibrate", compute, knobs.Calibrate, {"facts": FACTS, "board_photos": BOARD_PHOTOS}, {"camera": CAMERA})
