@@ -1,6 +1,6 @@
 """What passes between stages: frozen records whose fields state shape, unit, space and frame.
 
-Small records are pydantic models (validated, written as JSON, arrays as lists); pictures are `Raster`s (written as EXR).
+Small records are pydantic models (validated, written as JSON, arrays as lists); pictures are `Raster`s (EXR files).
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Camera(Record):
     source: str = "given"
 
     @property
-    def K(self) -> np.ndarray:  # noqa: N802 - the field's name for it
+    def K(self) -> np.ndarray:
         """(3, 3) intrinsic matrix, pixel origin of conventions."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 

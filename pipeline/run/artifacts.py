@@ -14,44 +14,59 @@ BRACKETS = Artifact("brackets", "json", "every RAW file by view, with its metada
 BOARD_PHOTOS = Artifact("board_photos", "json", "calibration photographs: file, sha256", type=list[dict[str, str]])
 
 MOSAICS = Artifact(
-    "mosaics", "rasters", "merged bracket of each view before demosaicking: Y, variance, mask", RADIANCE_UNIT, CAMERA_RGB
+    "mosaics",
+    "rasters",
+    "merged bracket of each view before demosaicking: Y, variance, mask",
+    RADIANCE_UNIT,
+    CAMERA_RGB,
 )
 EXPOSURES = Artifact(
-    "exposures", "json", "per view and frame: file, label and estimated exposure, sigma, clipped fraction",
+    "exposures",
+    "json",
+    "per view and frame: file, label and estimated exposure, sigma, clipped fraction",
     type=dict[str, list[dict[str, Any]]],
-)  # fmt: skip
-PHOTOGRAPHS = Artifact(
-    "photographs", "rasters", "developed view: R G B, variance.RGB, mask", RADIANCE_UNIT, ACESCG
-)  # fmt: skip
+)
+PHOTOGRAPHS = Artifact("photographs", "rasters", "developed view: R G B, variance.RGB, mask", RADIANCE_UNIT, ACESCG)
 
 CAMERA = Artifact("camera", "json", "intrinsics, distortion, covariance", "px", type=Camera)
 VIEWS = Artifact("views", "json", "pose of every view with covariance", "m, rad", type=dict[str, View])
 
 BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", type=dict[str, BallFit])
 ENVIRONMENT = Artifact(
-    "environment", "raster", "world-oriented lat-long at the ball: R G B, variance.RGB, seen (0..1)", RADIANCE_UNIT, ACESCG
+    "environment",
+    "raster",
+    "world-oriented lat-long at the ball: R G B, variance.RGB, seen (0..1)",
+    RADIANCE_UNIT,
+    ACESCG,
 )
 
 PLANE = Artifact("plane", "json", "plane of the local scene and its modelled rectangle", "m", type=Plane)
-ALBEDO = Artifact(
-    "albedo", "raster", "albedo of the modelled rectangle, as a texture: R G B, seen (0..1)", "1", ACESCG
-)  # fmt: skip
+ALBEDO = Artifact("albedo", "raster", "albedo of the modelled rectangle, as a texture: R G B, seen (0..1)", "1", ACESCG)
 
 LAYERS = Artifact(
-    "layers", "raster",
+    "layers",
+    "raster",
     "plate-sized render: obj.RGBA premultiplied, with.RGB (LS_obj) and without.RGB (LS_noobj) of the local scene, "
-    "their difference's variance, influence (0 or 1)", RADIANCE_UNIT, ACESCG,
-)  # fmt: skip
+    "their difference's variance, influence (0 or 1)",
+    RADIANCE_UNIT,
+    ACESCG,
+)
 COMPOSITE = Artifact(
-    "composite", "raster", "the photograph with the objects: R G B, and the layers mul, add, obj with "
-    "plate * mul + add + obj = result; guards (uint32)", RADIANCE_UNIT, ACESCG,
-)  # fmt: skip
+    "composite",
+    "raster",
+    "the photograph with the objects: R G B, and the layers mul, add, obj with "
+    "plate * mul + add + obj = result; guards (uint32)",
+    RADIANCE_UNIT,
+    ACESCG,
+)
 DISPLAY = Artifact("display", "picture", "composite through the display transform", "", "display")
 PLATE_DISPLAY = Artifact("plate_display", "picture", "plate through the display transform", "", "display")
 
 METRICS = Artifact("metrics", "json", "errors against truth; empty without truth", type=dict[str, Any])
 SELFCHECK = Artifact("selfcheck", "json", "predictions of what really stood there", type=dict[str, Any])
-ERROR_MAP = Artifact("error_map", "raster", "relative error and change error against truth: relative, change", "1", "data")
+ERROR_MAP = Artifact(
+    "error_map", "raster", "relative error and change error against truth: relative, change", "1", "data"
+)
 REPORT = Artifact("report", "page", "one self-contained page")
 
 # Supplied by the runner: stage -> numbers, warnings, evidence, params, seconds of every earlier stage.

@@ -27,12 +27,6 @@ def stage_names() -> tuple[str, ...]:
     return NAMES
 
 
-def summary_line(module: str) -> str:
-    """First docstring line of a module, read without importing it."""
-    path = closure.path_of(module)
-    return closure.docstring(path).partition("\n")[0] if path else ""
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The command line: one verb per stage and a few that join them."""
     parser = argparse.ArgumentParser(prog="insitu", description="Put objects into a photograph.", epilog=EPILOG)
@@ -58,11 +52,11 @@ def build_parser() -> argparse.ArgumentParser:
     verb("summary", "print results, errors against truth and seconds per stage")
     verb("verify", "recompute the digest of every file of a build")
     for name in stage_names():
-        sub = verb(name, summary_line(f"stages.{name}"))
+        sub = verb(name, closure.summary(f"stages.{name}"))
         sub.set_defaults(stage=name)
         if name == "evaluate":
             _scoring(sub)
-    simulate = verb("simulate", summary_line("stages.simulate"), capture=False)
+    simulate = verb("simulate", closure.summary("stages.simulate"), capture=False)
     simulate.add_argument("scene", type=Path, help="SCENE.toml")
     simulate.add_argument("folder", type=Path, help="folder of the new capture")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
@@ -143,7 +137,12 @@ def with_build(args: argparse.Namespace) -> int:
     out = out_of(args)
     if resolves or not (out / "settings.json").exists():
         chosen = asked.resolve(
-            args.capture, getattr(args, "scene", None), getattr(args, "quality", None), getattr(args, "set", []), KNOBS, PRESETS
+            args.capture,
+            getattr(args, "scene", None),
+            getattr(args, "quality", None),
+            getattr(args, "set", []),
+            KNOBS,
+            PRESETS,
         )
         asked.save(chosen, out)
     if args.verb == "settings":

@@ -56,6 +56,8 @@ def digest(module: str) -> str:
     return total.hexdigest()
 
 
-def docstring(path: Path) -> str:
-    """Module docstring of a file, without importing it."""
-    return ast.get_docstring(ast.parse(path.read_text())) or ""
+def summary(module: str) -> str:
+    """First docstring line of a module of this project, read without importing it."""
+    path = path_of(module)
+    text = ast.get_docstring(ast.parse(path.read_text())) if path else None
+    return (text or "").partition("\n")[0]

@@ -92,7 +92,9 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
         found = space_of_chromaticities(header.get("chromaticities"))
     if space is not None and found is not None and found != space:
         raise ArtifactError(f"{path}: colour space is {found}, expected {space}; re-run the stage that writes it")
-    known = {"compression", "type", "channels", "insitu:space", "chromaticities", "dataWindow", "displayWindow"}
+    known = {"compression", "type", "channels", "insitu:space", "dataWindow", "displayWindow"}
+    if found is not None:
+        known.add("chromaticities")  # primaries without a name stay in the attributes
     return Raster(channels, found or space or "unknown", {k: v for k, v in header.items() if k not in known})
 
 

@@ -206,7 +206,9 @@ def known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
         if field is None:
             return []
         options = [field.annotation, *getattr(field.annotation, "__args__", ())]
-        current = next((option for option in options if isinstance(option, type) and issubclass(option, BaseModel)), None)
+        current = next(
+            (option for option in options if isinstance(option, type) and issubclass(option, BaseModel)), None
+        )
     return list(getattr(current, "model_fields", {}))
 
 
@@ -257,5 +259,3 @@ def resolve_files(patterns: list[str], root: Path, where: str) -> tuple[list[Pat
             problems.append(f"{where}: is {pattern!r}; no such file in {root}")
         files.update(found)
     return sorted(files), problems
-
-

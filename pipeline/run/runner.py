@@ -65,7 +65,9 @@ class Build:
             producer = self.graph.producer[artifact.name].name
             record = self.record(producer)
             if record is None:
-                raise ArtifactError(f"{self.out / producer}: has not run; needed by {stage.name}; run insitu {producer}")
+                raise ArtifactError(
+                    f"{self.out / producer}: has not run; needed by {stage.name}; run insitu {producer}"
+                )
             digests[argument] = record["outputs"][artifact.name]
         return digests
 
@@ -91,7 +93,9 @@ class Build:
         start, cpu = time.perf_counter(), time.process_time()
         result = self._compute(stage)
         if set(result.outputs) != set(stage.outputs):
-            raise TypeError(f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}")
+            raise TypeError(
+                f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}"
+            )
         outputs = {}
         for key, artifact in stage.outputs.items():
             value = settle(artifact, result.outputs[key])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def resolve(
     scene: Path | None,
     quality: str | None,
     switches: list[str],
-    knobs: dict[str, type[BaseModel]],
+    knobs: Mapping[str, type[BaseModel]],
     presets: dict[str, dict[str, dict[str, Any]]],
 ) -> Settings:
     """Defaults, then the preset, then scene.toml's tables, then ``stage.knob=value`` switches.
@@ -65,7 +66,9 @@ def resolve(
         try:
             params[name] = model.model_validate({**values, **asked.get(name, {})}).model_dump()
         except ValidationError as error:
-            problems += [line.replace(str(path or default), "--set") for line in problems_of(error, Path("--set"), model, name)]
+            problems += [
+                line.replace(str(path or default), "--set") for line in problems_of(error, Path("--set"), model, name)
+            ]
     if problems:
         raise ManifestError(*problems)
     return Settings(
@@ -73,7 +76,9 @@ def resolve(
     )
 
 
-def parse_switches(switches: list[str], knobs: dict[str, type[BaseModel]]) -> tuple[dict[str, dict[str, Any]], list[str]]:
+def parse_switches(
+    switches: list[str], knobs: Mapping[str, type[BaseModel]]
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
     """``stage.knob=value`` strings as nested values (JSON where it parses, else text), and the problems."""
     asked: dict[str, dict[str, Any]] = {}
     problems = []

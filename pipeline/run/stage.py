@@ -22,7 +22,9 @@ class Artifact:
     @property
     def filename(self) -> str:
         """Path below the stage's folder."""
-        suffix = {"records": "", "json": ".json", "raster": ".exr", "rasters": "", "picture": ".png", "page": ".html"}[self.kind]
+        suffix = {"records": "", "json": ".json", "raster": ".exr", "rasters": "", "picture": ".png", "page": ".html"}[
+            self.kind
+        ]
         return self.name + suffix
 
 
@@ -54,7 +56,9 @@ class Graph:
                     raise TypeError(f"{stage.name}: reads {artifact.name}, which no earlier stage writes")
             for artifact in stage.outputs.values():
                 if artifact.name in self.producer:
-                    raise TypeError(f"{artifact.name} is written by {self.producer[artifact.name].name} and {stage.name}")
+                    raise TypeError(
+                        f"{artifact.name} is written by {self.producer[artifact.name].name} and {stage.name}"
+                    )
                 self.producer[artifact.name] = stage
 
     def __getitem__(self, name: str) -> Stage:

@@ -1,0 +1,141 @@
+"""Objects from .glb, .obj and .ply: triangles and metallic-roughness materials, in the file's own frame.
+
+Formats are trimesh's work; this adds what it loses (colour factors are rounded to 8 bit there) and refuses what it
+cannot decode.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.image.colour import decode_srgb
+from pipeline.run.errors import ManifestError
+
+GLB_MAGIC = b"glTF"
+SUPPORTED_EXTENSIONS = {"KHR_texture_transform", "KHR_materials_ior", "KHR_mesh_quantization"}
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """glTF metallic-roughness. Colours linear Rec.709; textures (H, W, C) linear, first row at v = 1, or None."""
+
+    base_color: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    metallic: float = 0.0
+    roughness: float = 0.5
+    base_texture: np.ndarray | None = None  # (H, W, 3), multiplies base_color
+    metallic_texture: np.ndarray | None = None  # (H, W)
+    roughness_texture: np.ndarray | None = None  # (H, W)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with one material. ``vertices`` (N, 3), ``faces`` (M, 3), ``normals`` (N, 3), ``uv`` (N, 2) or None."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    uv: np.ndarray | None
+    material: Material
+
+
+def load_meshes(path: Path) -> tuple[list[Mesh], list[str]]:
+    """Meshes of a file, node transforms applied, and what was left out (zero-area faces, unread material features).
+
+    Raises ManifestError when the file cannot be read, holds no triangles, or needs an extension that is not decoded.
+    """
+    import trimesh
+
+    factors: dict[str, dict[str, Any]] = {}
+    warnings: list[str] = []
+    if path.suffix.lower() == ".glb":
+        factors, warnings = _glb_materials(path)
+    try:
+        scene = trimesh.load_scene(path, process=False)
+    except Exception as error:  # trimesh raises whatever its parsers raise
+        raise ManifestError(f"{path}: not a readable {path.suffix} file ({type(error).__name__}: {error})") from error
+    meshes = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not hasattr(geometry, "faces") or len(geometry.faces) == 0:
+            continue
+        mesh, dropped = _convert(geometry, np.asarray(transform, float), factors)
+        if dropped:
+            warnings.append(
+                f"{path.name}: {dropped} of {dropped + len(mesh.faces)} faces have no area or are not finite; left out"
+            )
+        meshes.append(mesh)
+    if not meshes or not any(len(mesh.faces) for mesh in meshes):
+        raise ManifestError(f"{path}: holds no triangles")
+    return meshes, warnings
+
+
+def _glb_materials(path: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Metallic-roughness factors by material name, as written in the file, and warnings."""
+    with path.open("rb") as stream:
+        head = stream.read(20)
+        if len(head) < 20 or head[:4] != GLB_MAGIC:
+            raise ManifestError(f"{path}: starts with {head[:4]!r}; expected a binary glTF ('glTF')")
+        document = json.loads(stream.read(struct.unpack("<I", head[12:16])[0]))
+    missing = set(document.get("extensionsRequired", [])) - SUPPORTED_EXTENSIONS
+    if missing:
+        raise ManifestError(f"{path}: needs {', '.join(sorted(missing))}, which is not decoded; export it without")
+    warnings = []
+    factors = {}
+    for material in document.get("materials", []):
+        factors[material.get("name", "")] = material.get("pbrMetallicRoughness", {})
+        extra = sorted(
+            {"normalTexture", "emissiveTexture", "occlusionTexture"} & set(material)
+            | set(material.get("extensions", {}))
+        )
+        if any(material.get("emissiveFactor", [])):
+            extra.append("emissiveFactor")
+        if material.get("alphaMode", "OPAQUE") != "OPAQUE":
+            extra.append(f"alphaMode {material['alphaMode']}")
+        if extra:
+            warnings.append(f"{path.name}: material {material.get('name', '')!r}: not modelled: {', '.join(extra)}")
+    return factors, warnings
+
+
+def _convert(geometry: Any, transform: np.ndarray, factors: dict[str, dict[str, Any]]) -> tuple[Mesh, int]:
+    normals = np.asarray(geometry.vertex_normals, float) @ np.linalg.inv(transform[:3, :3])
+    vertices = np.asarray(geometry.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
+    faces = np.asarray(geometry.faces)
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    good = area > 1e-14 * max(np.ptp(vertices, axis=0).max(), 1e-30) ** 2
+    visual = geometry.visual
+    uv = getattr(visual, "uv", None)
+    material = _material(getattr(visual, "material", None), factors)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.tile([0.0, 1.0, 0.0], (len(normals), 1)), where=length > 0)
+    return Mesh(vertices, faces[good], normals, None if uv is None else np.asarray(uv, float), material), int(
+        (~good).sum()
+    )
+
+
+def _material(source: Any, factors: dict[str, dict[str, Any]]) -> Material:
+    if source is None or not hasattr(source, "baseColorFactor"):  # .obj and .ply: a diffuse colour at most
+        main = getattr(source, "main_color", None)
+        if main is None:
+            return Material()
+        return Material(base_color=tuple(decode_srgb(np.asarray(main[:3]) / 255.0).tolist()))
+    written = factors.get(source.name or "", {})
+    material = Material(
+        base_color=tuple(written.get("baseColorFactor", (1.0, 1.0, 1.0))[:3]),
+        metallic=float(written.get("metallicFactor", 1.0)),
+        roughness=float(written.get("roughnessFactor", 1.0)),
+    )
+    if source.baseColorTexture is not None:
+        texture = np.asarray(source.baseColorTexture.convert("RGB"), np.float32) / 255
+        material = replace(material, base_texture=decode_srgb(texture))
+    if source.metallicRoughnessTexture is not None:
+        texture = np.asarray(source.metallicRoughnessTexture.convert("RGB"), np.float32) / 255
+        material = replace(material, metallic_texture=texture[..., 2], roughness_texture=texture[..., 1])
+    return material
