@@ -1,10 +1,10 @@
 """Intrinsics and distortion from board photographs, with covariance; the distortion model is chosen by held-out error.
 
 Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
-(Gauss-Newton, poses eliminated). Models none, k1, k1 k2, and Brown's five are tried, then separate fx and fy; a richer one is taken
-only where photographs it was not fitted to improve by more than three standard errors. Covariance: inverse normal
-matrix of the chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all photographs; a flat
-board; terms left out have no variance, so the evidence says what they could cost.
+(Gauss-Newton, poses eliminated). Models none, k1, k1 k2, and Brown's five are tried, then separate fx and fy; a richer
+one is taken only where photographs it was not fitted to improve by more than three standard errors. Covariance:
+inverse normal matrix of the chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all
+photographs; a flat board; terms left out have no variance, so the evidence says what they could cost.
 """
 
 from __future__ import annotations
@@ -234,8 +234,8 @@ def judge(
     camera = chosen.camera
     if chosen.rms_px > params.max_rms_px:
         raise NumericalError(
-            f"calibrate: residual {chosen.rms_px:.2f} px, needed {params.max_rms_px} px; is the board flat, are square_m "
-            "and squares right, and focus and zoom the same in all photographs?"
+            f"calibrate: residual {chosen.rms_px:.2f} px, needed {params.max_rms_px} px; is the board flat, are "
+            "square_m and squares right, and focus and zoom the same in all photographs?"
         )
     sigma = np.sqrt(np.diag(camera.covariance))
     relative = float(sigma[0] / camera.fx)
@@ -243,8 +243,8 @@ def judge(
     tilts = np.degrees([np.arccos(min(1.0, abs(pose[1, 2]))) for pose in chosen.poses])
     if tilts.max() < TILT_DEG or relative > 0.01:
         text = (
-            f"calibrate: board tilts reach {tilts.max():.0f} deg and the focal length is known to {relative:.2%}, needed "
-            "tilts of 30 deg and 1 %; add photographs with the board tilted 30 to 45 degrees in several directions"
+            f"calibrate: board tilts reach {tilts.max():.0f} deg and the focal length is known to {relative:.2%}, "
+            "needed tilts of 30 deg and 1 %; add photographs with the board tilted 30 to 45 degrees several ways"
         )
         if relative > 0.05:
             raise NumericalError(text)

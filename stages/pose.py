@@ -178,8 +178,8 @@ def given_view(name: str, order: dict[str, Any]) -> View:
     error = float(np.abs(matrix[:3, :3] - rotation).max())
     if error > 1e-3 or not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise ManifestError(
-            f"pose: view {name}: world_from_camera is off a rigid motion by {error:.3g}; expected a rotation (no scale, "
-            "no mirror) and a last row 0 0 0 1"
+            f"pose: view {name}: world_from_camera is off a rigid motion by {error:.3g}; expected a rotation (no "
+            "scale, no mirror) and a last row 0 0 0 1"
         )
     rigid = matrix.copy()
     rigid[:3, :3] = rotation
