@@ -80,7 +80,7 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
         raise ArtifactError(f"{path}: missing; run the stage that writes it")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            header, pixels = file.header(), file.channels()
+            header, pixels = dict(file.header()), file.channels()  # closing the file empties its header
             channels = {
                 name: np.asarray(c.pixels, np.uint32 if c.pixels.dtype == np.uint32 else np.float32)
                 for name, c in pixels.items()
@@ -93,7 +93,8 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
     if space is not None and found is not None and found != space:
         raise ArtifactError(f"{path}: colour space is {found}, expected {space}; re-run the stage that writes it")
     known = {"compression", "type", "channels", "insitu:space", "dataWindow", "displayWindow"}
-    if found is not None:
+    known |= {"lineOrder", "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth"}
+    if found not in (None, "unknown"):
         known.add("chromaticities")  # primaries without a name stay in the attributes
     return Raster(channels, found or space or "unknown", {k: v for k, v in header.items() if k not in known})
 

@@ -1,0 +1,120 @@
+"""The truth of a capture: what a noise-free camera would have seen, and what really stood there.
+
+Read from a ``truth.json`` (only `stages/evaluate.py` opens it, after everything is done):
+
+    space       "acescg" or "linear_rec709", of every picture named here
+    root        folder of the files; default: that of truth.json; environment variables expand
+    plate       EXR; with_objects: EXR
+    coverage    EXR with one float channel per object, or PNG whose R, G, B are ``coverage_names``
+    albedo      EXR, optional: R G B and ``seen``, of the plane as the plate camera sees it
+    environment {"file", "world_from_map"}: lat-long, formula of conventions; 3x3 rotation of its directions to world
+    camera      {width height fx fy cx cy distortion}, first pixel centre (0.5, 0.5)
+    views       {name: {"world_from_camera": 4x4}}
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.image.colour import (
+    ACESCG_CHROMATICITIES,
+    Space,
+    adaptation,
+    apply_matrix,
+    convert,
+    matrix,
+    xyz_from_rgb,
+    xyz_of_xy,
+)
+from pipeline.run import formats
+from pipeline.run.errors import ArtifactError, ManifestError
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Pictures are ACEScg float32, in the truth's own unit; absent things are None or empty."""
+
+    plate: np.ndarray  # (H, W, 3)
+    with_objects: np.ndarray  # (H, W, 3)
+    coverage: dict[str, np.ndarray]  # (H, W) in [0, 1] of each object
+    albedo: np.ndarray | None = None  # (H, W, 4): RGB and seen
+    environment: np.ndarray | None = None  # (h, w, 3)
+    world_from_map: np.ndarray = field(default_factory=lambda: np.eye(3))
+    camera: dict[str, Any] = field(default_factory=dict)
+    views: dict[str, np.ndarray] = field(default_factory=dict)  # (4, 4) world_from_camera
+
+
+def load_truth(path: Path) -> Truth:
+    """Read a truth.json and its pictures. Raises ManifestError naming the wrong key, ArtifactError for files."""
+    try:
+        facts = json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ManifestError(f"{path}: not a readable truth.json ({error}); fix capture.toml's truth") from error
+    missing = [key for key in ("plate", "with_objects", "coverage") if key not in facts]
+    space: Space = facts.get("space", "acescg")
+    if missing or space not in ("acescg", "linear_rec709"):
+        raise ManifestError(f"{path}: missing keys {missing}, space {space!r}; see pipeline/image/truth.py")
+    folder = path.parent / os.path.expandvars(facts.get("root", "."))
+
+    def picture(name: str) -> np.ndarray:
+        return convert(formats.read_exr(folder / name).rgb(), space, "acescg")
+
+    plate, with_objects = picture(facts["plate"]), picture(facts["with_objects"])
+    coverage = _coverage(folder / facts["coverage"], facts.get("coverage_names"), path)
+    for name, found in {"with_objects": with_objects, **coverage}.items():
+        if found.shape[:2] != plate.shape[:2]:
+            raise ManifestError(f"{path}: {name} is {found.shape[:2]}, the plate {plate.shape[:2]}; render both alike")
+    light = facts.get("environment")
+    return Truth(
+        plate=plate,
+        with_objects=with_objects,
+        coverage=coverage,
+        albedo=_albedo(folder / facts["albedo"], space) if facts.get("albedo") else None,
+        environment=picture(light["file"]) if light else None,
+        world_from_map=np.asarray(light.get("world_from_map", np.eye(3)) if light else np.eye(3), float),
+        camera=facts.get("camera", {}),
+        views={n: np.asarray(v["world_from_camera"], float) for n, v in facts.get("views", {}).items()},
+    )
+
+
+def _coverage(file: Path, names: list[str] | None, path: Path) -> dict[str, np.ndarray]:
+    if file.suffix == ".exr":
+        return formats.read_exr(file).channels
+    mask = formats.read_png(file)
+    if not names or mask.ndim != 3 or len(names) > mask.shape[2]:
+        raise ManifestError(f"{path}: coverage_names is {names} for {file.name} {mask.shape}; name its R, G, B")
+    mask = (mask / np.iinfo(mask.dtype).max).astype(np.float32)
+    return {name: mask[..., i] for i, name in enumerate(names)}
+
+
+def _albedo(file: Path, space: Space) -> np.ndarray:
+    raster = formats.read_exr(file)
+    seen = raster.channels.get("seen", np.ones(raster.shape, np.float32))
+    return np.concatenate([convert(raster.rgb(), space, "acescg"), seen[..., None]], -1)
+
+
+def read_acescg(path: Path) -> np.ndarray:
+    """(H, W, 3) ACEScg of any EXR with R G B, or of its first layer that has them.
+
+    Primaries come from the file's chromaticities (Bradford to the white of ACES), else they are taken as ACEScg.
+    """
+    raster = formats.read_exr(path)
+    layers = sorted(name[:-1].rstrip(".") for name in raster.channels if name == "R" or name.endswith(".R"))
+    layers = [name for name in layers if all((f"{name}." if name else "") + c in raster.channels for c in "RGB")]
+    if not layers:
+        raise ArtifactError(f"{path}: channels {sorted(raster.channels)}, needed R G B; export a colour picture")
+    rgb = raster.rgb(layers[0])
+    if raster.space == "linear_rec709":
+        return convert(rgb, "linear_rec709", "acescg")
+    chromaticities = raster.attributes.get("chromaticities")
+    if chromaticities is None:
+        return rgb
+    primaries = np.asarray(chromaticities, float).reshape(4, 2)
+    to_aces = adaptation(xyz_of_xy(primaries[3]), xyz_of_xy(ACESCG_CHROMATICITIES[3]))
+    return apply_matrix(matrix("xyz", "acescg") @ to_aces @ xyz_from_rgb(primaries), rgb)

@@ -1,0 +1,200 @@
+"""Predictions of what really stood there, from what was estimated: the mirror ball, its shadow, the board's paper.
+
+Forward models on purpose: the probe stage goes from map to ball, these go from the ball's pixel to the map, so a wrong
+sign in one is not hidden by the same wrong sign in the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.camera.lens import pixel_rays, project
+from pipeline.conventions import (
+    invert_rigid,
+    latlong_directions,
+    latlong_from_direction,
+    latlong_solid_angles,
+    transform_points,
+)
+from pipeline.image.metrics import box
+from pipeline.light.environment import resize_environment
+from pipeline.light.mirror_ball import directions_from_rays
+from pipeline.light.sampling import bilinear, planes
+from pipeline.types import BallFit, Camera, Plane
+
+SHADOW_MAP = (64, 128)  # texels of the light that casts the ball's shadow: 2.8 deg, the ball is 20 deg and more
+SAMPLE_ROW = 1024
+OUTLINE_PX = 4.0  # rim of the ball's picture that is left out beside its silhouette
+
+
+def sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values (N, C) of a picture (H, W, C) at any number of pixel positions (N,), bilinear, border repeated."""
+    if not x.size:
+        return np.zeros((0, picture.shape[2]), np.float32)
+    shape = (-(-x.size // SAMPLE_ROW), SAMPLE_ROW)  # OpenCV takes at most 32767 positions in one row
+    found = bilinear(planes(picture), np.resize(x, shape), np.resize(y, shape))
+    return found.reshape(-1, picture.shape[2])[: x.size]
+
+
+def lookup(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Radiance (N, C) of a lat-long map (H, W, C) in world ``directions`` (N, 3), bilinear, wrapping around."""
+    height, width = environment.shape[:2]
+    u, v = latlong_from_direction(directions)
+    around = np.concatenate([environment[:, -1:], environment, environment[:, :1]], 1)
+    return sample(around, u * width + 1, v * height)
+
+
+def ball_crop(camera: Camera, ball: BallFit, margin: float = 1.25) -> tuple[slice, slice]:
+    """Rows and columns of the picture around the ball, ``margin`` radii to each side, inside the frame."""
+    x, y = project(camera, ball.centre_camera_m[None])[0]
+    reach = margin * ball.radius_px
+    rows = slice(max(0, int(y - reach)), min(camera.height, int(np.ceil(y + reach))))
+    return rows, slice(max(0, int(x - reach)), min(camera.width, int(np.ceil(x + reach))))
+
+
+def pixel_centres(rows: slice, columns: slice) -> np.ndarray:
+    """(h, w, 2) x, y of the pixels of a crop."""
+    y, x = np.mgrid[rows, columns]
+    return np.stack([x, y], -1) + 0.5
+
+
+def ball_directions(
+    camera: Camera, ball: BallFit, world_from_camera: np.ndarray, rows: slice, columns: slice
+) -> tuple[np.ndarray, np.ndarray]:
+    """World directions (h, w, 3) mirrored in each pixel of a crop, and sine of the incidence (h, w); NaN outside."""
+    px = pixel_centres(rows, columns)
+    rays = pixel_rays(camera, px.reshape(-1, 2))
+    mirrored = directions_from_rays(rays, ball.centre_camera_m, ball.radius_m) @ world_from_camera[:3, :3].T
+    sine = np.linalg.norm(np.cross(rays, ball.centre_camera_m), axis=-1) / ball.radius_m
+    sine[~np.isfinite(mirrored[:, 0])] = np.nan
+    return mirrored.reshape(*px.shape[:2], 3), sine.reshape(px.shape[:2])
+
+
+def mirrored_picture(environment: np.ndarray, directions: np.ndarray, reflectance: np.ndarray) -> np.ndarray:
+    """The ball's picture (h, w, 3) from its directions (h, w, 3): map x reflectance; NaN outside the ball."""
+    picture = np.full(directions.shape, np.nan, np.float32)
+    inside = np.isfinite(directions[..., 0])
+    picture[inside] = lookup(environment, directions[inside]) * reflectance
+    return picture
+
+
+def splat(directions: np.ndarray, values: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (H, W, 3) of the values (N, 3) that fall into each texel of a lat-long map, and how many (H, W)."""
+    u, v = latlong_from_direction(directions)
+    texel = np.minimum((v * height).astype(int), height - 1) * width + np.minimum((u * width).astype(int), width - 1)
+    count = np.bincount(texel, minlength=height * width)
+    sums = np.stack([np.bincount(texel, values[:, c], height * width) for c in range(values.shape[1])], -1)
+    mean = np.divide(sums, count[:, None], out=np.zeros_like(sums), where=count[:, None] > 0)
+    return mean.reshape(height, width, -1), count.reshape(height, width)
+
+
+def ball_shadow(
+    environment: np.ndarray, points: np.ndarray, normal: np.ndarray, centre: np.ndarray, radius: float,
+    reflectance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Ratio (N, 3) of the irradiance with a mirror ball to that without, at plane ``points`` (N, 3), world frame.
+
+    First result: the ball only blocks light. Second: it also mirrors the map once towards the point. The map is
+    distant; its texels (2.8 deg) soften the edge, the visible part of a cut texel is taken as linear in the angle.
+    """
+    light = resize_environment(environment, *SHADOW_MAP)
+    directions, weight = latlong_directions(*SHADOW_MAP), latlong_solid_angles(*SHADOW_MAP)
+    cosine = directions @ normal
+    above = cosine > 0
+    ways = directions[above].astype(np.float32)
+    flux = (light[above] * (weight * cosine)[above][:, None]).astype(np.float32)
+    arm = centre - points
+    distance = np.linalg.norm(arm, axis=-1)
+    limit = np.arcsin(np.minimum(radius / distance, 1)).astype(np.float32)
+    along = (arm.astype(np.float32)) @ ways.T  # (N, M) metres
+    angle = np.arccos(np.clip(along / distance[:, None].astype(np.float32), -1, 1))
+    hidden = np.clip(0.5 + (limit[:, None] - angle) * np.float32(SHADOW_MAP[0] / np.pi), 0, 1)
+    total = flux.sum(0)
+    blocked = hidden @ flux
+    mirrored = np.zeros_like(blocked)
+    point, way = np.nonzero(angle < limit[:, None])
+    if point.size:
+        reach = along[point, way]
+        step = reach - np.sqrt(np.maximum(reach**2 - distance[point] ** 2 + radius**2, 0))
+        outward = (step[:, None] * ways[way] - arm[point]) / radius
+        away = ways[way] - 2 * (ways[way] * outward).sum(-1, keepdims=True) * outward
+        bounced = lookup(light, away) * reflectance * (weight * cosine)[above][way][:, None]
+        bounced *= hidden[point, way][:, None]
+        mirrored = np.stack([np.bincount(point, bounced[:, c], len(points)) for c in range(3)], -1)
+    return 1 - blocked / total, 1 - (blocked - mirrored) / total
+
+
+def shadow_ratio(
+    photograph: np.ndarray, plate: np.ndarray, bad: np.ndarray, camera: Camera, world_from_camera: np.ndarray,
+    ball: BallFit, points: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Measured ratio (N, 3) of 5x5 means, photograph over plate, at world ``points`` (N, 3); and which are usable (N,).
+
+    Not usable: outside the frame, a ``bad`` (H, W) pixel among the 25, or behind or beside the ball's own picture.
+    """
+    local = transform_points(invert_rigid(world_from_camera), points)
+    px = project(camera, local)
+    inside = np.isfinite(px).all(-1) & (px > 3).all(-1) & (px < (camera.width - 3, camera.height - 3)).all(-1)
+    towards = ball.centre_camera_m / np.linalg.norm(ball.centre_camera_m)
+    away = np.arccos(np.clip(local @ towards / np.linalg.norm(local, axis=-1), -1, 1))
+    silhouette = np.arcsin(ball.radius_m / np.linalg.norm(ball.centre_camera_m))
+    usable = inside & (away > silhouette + OUTLINE_PX / camera.fx)
+    ratio = np.full(points.shape, np.nan)
+    if not usable.any():
+        return ratio, usable
+    column, row = px[usable].astype(int).T
+    crop = slice(row.min() - 3, row.max() + 4), slice(column.min() - 3, column.max() + 4)
+    at = row - crop[0].start, column - crop[1].start
+    numerator, denominator = box(photograph[crop])[at], box(plate[crop])[at]
+    clean = (box(bad[crop].astype(float))[at] < 1e-6) & (denominator > 0).all(-1)
+    found = np.full(numerator.shape, np.nan)
+    found[clean] = numerator[clean] / denominator[clean]
+    ratio[usable] = found
+    usable[usable] = clean
+    return ratio, usable
+
+
+def plane_coordinates(plane: Plane, points: np.ndarray) -> np.ndarray:
+    """(N, 2) position of world ``points`` (N, 3) in the modelled rectangle, 0..1 along its first and its last edge."""
+    origin, along, _, down = plane.corners_m
+    edges = np.stack([along - origin, down - origin], -1)
+    return np.linalg.lstsq(edges, (points - origin).T, rcond=None)[0].T
+
+
+def plane_texture(plane: Plane, texture: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N, C) of a texture (h, w, C) over the rectangle at world ``points`` (N, 3); NaN outside it."""
+    at = plane_coordinates(plane, points)
+    height, width = texture.shape[:2]
+    values = sample(texture, at[:, 0] * width, at[:, 1] * height)
+    values[~((at >= 0) & (at <= 1)).all(-1)] = np.nan
+    return values
+
+
+def plane_hits(plane: Plane, camera: Camera, world_from_camera: np.ndarray, px: np.ndarray) -> np.ndarray:
+    """World points (N, 3) where the rays of pixels (N, 2) meet the plane; NaN where they do not, in front."""
+    rays = pixel_rays(camera, px) @ world_from_camera[:3, :3].T
+    start = world_from_camera[:3, 3]
+    slope = rays @ plane.normal
+    with np.errstate(divide="ignore", invalid="ignore"):  # grazing rays: no hit
+        distance = (plane.offset_m - start @ plane.normal) / slope
+    return start + np.where(distance > 0, distance, np.nan)[:, None] * rays
+
+
+def paper_points(squares: tuple[int, int], square_m: float, marker_m: float, legacy: bool) -> np.ndarray:
+    """World points (N, 3) on the white paper of a ChArUco board: midway between the markers and their squares' edges.
+
+    The squares that hold markers are those with odd row + column (OpenCV), even in the legacy layout with even rows.
+    """
+    columns, rows = squares
+    first = 0 if legacy and rows % 2 == 0 else 1
+    reach = (square_m + marker_m) / 4  # from the square's centre to the middle of the white rim
+    steps = np.linspace(-0.8, 0.8, 9) * reach
+    rim = [(s, t * reach) for s in steps for t in (-1, 1)] + [(t * reach, s) for s in steps for t in (-1, 1)]
+    centres = [
+        ((c + 0.5) * square_m, (r + 0.5) * square_m)
+        for r in range(rows)
+        for c in range(columns)
+        if (r + c) % 2 == first
+    ]
+    flat = (np.array(centres)[:, None] + np.array(rim)[None]).reshape(-1, 2)
+    return np.stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]], -1)
