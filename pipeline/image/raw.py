@@ -60,8 +60,8 @@ def read_metadata(path: Path, name: str = "") -> Frame:
 def read_mosaic(path: Path, frame: Frame) -> np.ndarray:
     """Active area of the mosaic as stored, (H, W) uint16 DN, black not subtracted.
 
-    Raises CaptureError when the file cannot be decoded, has another size than ``frame`` says, or is constant below white (LibRaw
-    decodes some damaged files to zeros without an error).
+    Raises CaptureError when the file cannot be decoded, has another size than ``frame`` says, or is constant below
+    white (LibRaw decodes some damaged files to zeros without an error).
     """
     import rawpy
 

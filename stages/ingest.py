@@ -1,0 +1,190 @@
+"""ingest: capture.toml, scene.toml and the photographs -> indexes
+
+Method: both manifests are validated and every RAW file is asked for its metadata; all problems are reported together,
+one line each. Photographs are never copied: what later stages get is an index of paths, digests and metadata. This is
+the one stage that looks outside the build, so it is asked at every run.
+
+Frames of a view are sorted by exposure (label), then by name, so the order of the listing never matters; a file given
+twice (same content) counts once. An exposure that EXIF lacks must be stated in [[exposure]]; it is never invented.
+
+Limits: Bayer RAW of one camera; every view has the plate's size.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipeline.image.exposure import exposure_of
+from pipeline.image.raw import file_sha256, read_metadata
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, WISHES
+from pipeline.run.errors import CaptureError, ManifestError
+from pipeline.run.manifest import CaptureFacts, SceneWishes, load_capture, load_toml, problems_of, resolve_files
+from pipeline.run.stage import Stage
+from pipeline.types import Bracket, Frame, Result
+from stages import knobs
+
+OBJECT_SUFFIXES = (".glb", ".obj", ".ply")
+DEFAULT_SCENE = "scene.toml"
+
+
+def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest) -> Result:
+    """Validated facts and wishes, brackets by view name, board photographs.
+
+    Raises ManifestError (text) or CaptureError (photographs) listing every problem found.
+    """
+    facts, manifest, root = load_capture(capture_folder)
+    problems: list[str] = []
+    flaws: list[str] = []
+    warnings: list[str] = []
+    scene = scene_file or next((f for f in [manifest.parent / DEFAULT_SCENE] if f.is_file()), None)
+    wishes = _wishes(scene, root, problems)
+    board = _board_photos(facts, root, manifest, problems)
+    dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
+    brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
+    if problems:
+        raise ManifestError(*problems, *flaws)
+    if flaws:
+        raise CaptureError("\n".join(flaws))
+    numbers = {
+        "frames": {name: len(bracket.frames) for name, bracket in brackets.items()},
+        "board_photos": len(board),
+        "objects": len(wishes["object"]),
+        "size_px": [brackets["plate"].frames[0].width, brackets["plate"].frames[0].height],
+        "camera": brackets["plate"].frames[0].camera,
+    }
+    outputs = {"facts": dumped, "wishes": wishes, "brackets": brackets, "board_photos": board}
+    return Result(outputs, numbers, warnings)
+
+
+def _wishes(scene: Path | None, root: Path, problems: list[str]) -> dict[str, Any]:
+    """scene.toml less the stages' knobs, each object with its path and digest; all defaults without a scene."""
+    data: dict[str, Any] = {} if scene is None else load_toml(scene)
+    try:
+        wishes = SceneWishes.model_validate({k: v for k, v in data.items() if k not in knobs.KNOBS})
+    except ValidationError as error:
+        problems.extend(problems_of(error, scene or Path(DEFAULT_SCENE), SceneWishes))
+        return {"object": []}
+    dumped = wishes.model_dump(mode="json")
+    for number, wish in enumerate(dumped["object"]):
+        where = f"{scene}: object[{number}].file"
+        folders = [scene.parent, root] if scene else [root]
+        file = Path(os.path.expandvars(wish["file"]))
+        found = next((folder / file for folder in folders if (folder / file).is_file()), None)
+        if file.suffix.lower() not in OBJECT_SUFFIXES:
+            problems.append(f"{where}: is {wish['file']!r}; expected a .glb, .obj or .ply file")
+        elif found is None:
+            problems.append(f"{where}: is {wish['file']!r}; no such file in {' or '.join(map(str, folders))}")
+        else:
+            wish |= {"path": str(found.resolve()), "sha256": file_sha256(found)}
+    return dumped
+
+
+def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str]) -> list[dict[str, str]]:
+    files, found = resolve_files(facts.camera.calibration, root, f"{manifest}: camera.calibration")
+    problems.extend(found)
+    return [{"file": file.relative_to(root).as_posix(), "sha256": file_sha256(file)} for file in files]
+
+
+def _truth(facts: CaptureFacts, manifest: Path, problems: list[str]) -> dict[str, str]:
+    """Where a simulated capture's truth lies, for evaluate alone."""
+    if facts.truth is None:
+        return {}
+    path = (manifest.parent / os.path.expandvars(facts.truth)).resolve()
+    if not path.is_file():
+        problems.append(f"{manifest}: truth: is {facts.truth!r}; no such file ({path})")
+        return {}
+    return {"truth_path": str(path), "truth_sha256": file_sha256(path)}
+
+
+def _brackets(
+    facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str], warnings: list[str]
+) -> dict[str, Bracket]:
+    """Every view's frames, read in parallel (decoders and digests release the interpreter)."""
+    patterns = {"plate": facts.plate.files, **{ball.name: ball.files for ball in facts.ball}}
+    stated = _stated_exposures(facts, root, manifest, problems)
+    listing = {}
+    for number, (name, wanted) in enumerate(patterns.items()):
+        where = f"{manifest}: {'plate' if name == 'plate' else f'ball[{number - 1}]'}.files"
+        listing[name], found = resolve_files(wanted, root, where)
+        problems.extend(found)
+
+    def read(path: Path) -> Frame | str:
+        try:
+            return read_metadata(path, path.relative_to(root).as_posix())
+        except CaptureError as error:
+            return str(error)
+
+    unique = sorted({file for files in listing.values() for file in files})
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        read_files = dict(zip(unique, pool.map(read, unique)))
+    flaws.extend(flaw for flaw in read_files.values() if isinstance(flaw, str))
+    brackets = {}
+    for name, files in listing.items():
+        frames = [_restated(frame, stated.get(f, {})) for f in files if isinstance(frame := read_files[f], Frame)]
+        role = "plate" if name == "plate" else "ball"
+        brackets[name] = Bracket(name=name, role=role, frames=_sorted_unique(name, frames, flaws, warnings))
+    _check_sizes(brackets, flaws)
+    return brackets
+
+
+def _stated_exposures(
+    facts: CaptureFacts, root: Path, manifest: Path, problems: list[str]
+) -> dict[Path, dict[str, float]]:
+    """What [[exposure]] says, by file; a later table adds to an earlier one."""
+    stated: dict[Path, dict[str, float]] = {}
+    for number, entry in enumerate(facts.exposure):
+        files, found = resolve_files(entry.files, root, f"{manifest}: exposure[{number}].files")
+        problems.extend(found)
+        for file in files:
+            stated.setdefault(file, {}).update(entry.model_dump(exclude={"files"}, exclude_none=True))
+    return stated
+
+
+def _restated(frame: Frame, stated: dict[str, float]) -> Frame:
+    return frame.model_copy(update=stated) if stated else frame
+
+
+def _sorted_unique(view: str, frames: list[Frame], flaws: list[str], warnings: list[str]) -> list[Frame]:
+    """Frames with a known exposure, shortest first, each content once."""
+    kept: dict[str, Frame] = {}
+    for frame in sorted(frames, key=lambda frame: frame.file):
+        lacking = [key for key in ("exposure_s", "iso", "fnumber") if not getattr(frame, key) > 0]
+        if lacking:
+            flaws.append(
+                f"{frame.file}: {', '.join(lacking)} missing in EXIF, needed for radiance; "
+                f'state it in capture.toml: [[exposure]] files = ["{frame.file}"], '
+                + ", ".join(f"{k} = ..." for k in lacking)
+            )
+        elif frame.sha256 in kept:
+            warnings.append(f"{frame.file}: same content as {kept[frame.sha256].file} in view {view}; counted once")
+        else:
+            kept[frame.sha256] = frame
+    return sorted(kept.values(), key=lambda frame: (exposure_of(frame), frame.file))
+
+
+def _check_sizes(brackets: dict[str, Bracket], flaws: list[str]) -> None:
+    """One size and one colour filter within a bracket; balls as large as the plate, since one camera serves all."""
+    reference = brackets["plate"].frames[0] if brackets["plate"].frames else None
+    for name, bracket in brackets.items():
+        kinds = sorted({(frame.width, frame.height, frame.cfa) for frame in bracket.frames})
+        shown = ", ".join(f"{width} x {height} {cfa}" for width, height, cfa in kinds)
+        if len(kinds) > 1:
+            flaws.append(f"{name}: its frames are {shown}; needed one size and colour filter; take out the strangers")
+        elif reference and kinds and kinds[0] != (reference.width, reference.height, reference.cfa):
+            expected = f"{reference.width} x {reference.height} {reference.cfa}"
+            flaws.append(f"{name}: its frames are {shown}, the plate's {expected}; use one camera and one RAW size")
+
+
+STAGE = Stage(
+    "ingest",
+    compute,
+    knobs.Ingest,
+    inputs={},
+    outputs={"facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS},
+    impure=True,
+)

@@ -1,0 +1,340 @@
+"""merge: RAW brackets -> radiance of each view before demosaicking, with variance and mask
+
+Method: per CFA cell black and clip level; noise from DNG NoiseProfile, else measured between the frames (photon
+transfer), else assumed with a warning; exposures estimated from the frames with the labels as prior; inverse-variance
+weights (Poisson or with read noise), unbiased at clip and in the dark; chi-square flags what moved; defective
+photosites replaced. pipeline/image/{radiometry,exposure,noise}.py hold the equations and their sources.
+
+Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
+Limits: frames of a view are not aligned; their shift is measured and reported. Views that share no exposure setting
+with the plate are scaled by their labels.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
+from pipeline.image import exposure, noise, radiometry
+from pipeline.image.exposure import Ratio
+from pipeline.image.noise import Noise
+from pipeline.image.radiometry import Exposed, Merged
+from pipeline.image.raw import read_mosaic
+from pipeline.run.artifacts import BRACKETS, EXPOSURES, FACTS, MOSAICS
+from pipeline.run.stage import Stage
+from pipeline.types import Bracket, Frame, Raster, Result
+from stages import knobs
+
+SAMPLE_PIXELS = 2_000_000  # of a frame, for ratios and photon transfer
+SHIFT_WARNING_PX = 0.5
+LABEL_WARNING = 0.1
+
+
+def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.Merge) -> Result:
+    """Merged mosaics by view and the exposures of their frames. Raises CaptureError when a file cannot be decoded."""
+    root = Path(facts["capture_root"])
+    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params)
+
+
+def merge_brackets(brackets: dict[str, Bracket], decode: Callable[[Frame], np.ndarray], params: knobs.Merge) -> Result:
+    """The stage on mosaics wherever they come from: ``decode(frame)`` gives (H, W) DN."""
+    workers = os.cpu_count() or 1
+    entries = [(view, frame) for view, bracket in sorted(brackets.items()) for frame in _ordered(bracket.frames)]
+    views, frames = [view for view, _ in entries], [frame for _, frame in entries]
+    with ThreadPoolExecutor(workers) as pool:
+        mosaics = list(pool.map(decode, frames))
+    warnings: list[str] = []
+    models, limits, noise_numbers = _noise_models(views, frames, mosaics, warnings)
+    ratios = _ratios(views, frames, mosaics, models, limits) if params.estimate_exposures else []
+    offsets, sigmas = _exposures(views, frames, ratios, params, warnings)
+    exposed = [
+        Exposed(
+            mosaic, exposure.exposure_of(frame) * float(np.exp(offset)), frame_black(frame), frame.white, limit, model
+        )
+        for frame, mosaic, offset, limit, model in zip(frames, mosaics, offsets, limits, models)
+    ]
+    rasters, numbers = {}, {}
+    profile = colour_profile(brackets, warnings)
+    for view in brackets:
+        members = [one for one, name in zip(exposed, views) if name == view]
+        merged, hot = radiometry.replace_defects(radiometry.merge(members, params.weights, workers))
+        rasters[view] = raster_of(merged, next(f for f, name in zip(frames, views) if name == view), profile)
+        numbers[view] = _view_numbers(merged, hot, len(members))
+        _warn_extremes(view, numbers[view], warnings)
+    listing = _exposure_rows(brackets, views, frames, exposed, offsets, sigmas)
+    shifts = _shifts(views, exposed)
+    evidence = _evidence(models, ratios, shifts, numbers, warnings)
+    totals = {"noise": noise_numbers, "ratios_measured": len(ratios), "shift_px": max(shifts.values(), default=0.0)}
+    return Result({"mosaics": rasters, "exposures": listing}, {**numbers, **totals}, warnings, evidence)
+
+
+def _ordered(frames: list[Frame]) -> list[Frame]:
+    return sorted(frames, key=lambda frame: (exposure.exposure_of(frame), frame.file))
+
+
+def frame_black(frame: Frame) -> np.ndarray:
+    """(2, 2) black level in DN."""
+    return np.broadcast_to(frame.black, (2, 2)).astype(float)
+
+
+def _sample(mosaic: np.ndarray) -> np.ndarray:
+    """Whole CFA rows of a mosaic, few enough for statistics."""
+    step = max(1, round(mosaic.size / SAMPLE_PIXELS))
+    if step == 1:
+        return mosaic
+    rows = np.arange(mosaic.shape[0])
+    return mosaic[(rows // 2) % step == 0]
+
+
+def _signal(frame: Frame, mosaic: np.ndarray) -> np.ndarray:
+    """(N,) normalised signal of the sample."""
+    blank = Noise(np.zeros((2, 2)), np.zeros((2, 2)), "")
+    return Exposed(_sample(mosaic), 1.0, frame_black(frame), frame.white, np.ones((2, 2)), blank).signal().ravel()
+
+
+def _neighbours(views: list[str], frames: list[Frame]) -> list[tuple[int, int]]:
+    """Index pairs (longer, shorter) of frames that follow each other in a view."""
+    return [(i + 1, i) for i in range(len(frames) - 1) if views[i] == views[i + 1]]
+
+
+def _noise_models(
+    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], warnings: list[str]
+) -> tuple[list[Noise], list[np.ndarray], dict[str, Any]]:
+    """Noise and linear limit of every frame; frames of one ISO and camera share what is measured."""
+    groups: dict[tuple[str, float, float], list[int]] = {}
+    for index, frame in enumerate(frames):
+        groups.setdefault((frame.camera, frame.iso, frame.white), []).append(index)
+    models: list[Noise] = [noise.assumed(frame.iso, frame.white) for frame in frames]
+    limits: list[np.ndarray] = [np.ones((2, 2))] * len(frames)
+    numbers: dict[str, Any] = {}
+    for (_, iso, white), members in groups.items():
+        black = frame_black(frames[members[0]])
+        step = 1 / (white - float(black.mean()))
+        level = radiometry.clip_levels([mosaics[i] for i in members], white, black)
+        if np.any(level < white):
+            warnings.append(
+                f"ISO {iso:g}: frames clip at {level.min():.0f} DN, metadata say {white:.0f}; the lower is used"
+            )
+        measured = noise.from_profile(frames[members[0]]) or _transfer(views, frames, mosaics, members, level, step)
+        if measured is None:
+            measured = noise.assumed(iso, white - float(black.mean()))
+            warnings.append(
+                f"ISO {iso:g}: no NoiseProfile and too few frames to measure noise; a usual sensor is assumed"
+            )
+        for i in members:
+            models[i] = noise.from_profile(frames[i]) or measured
+            limits[i] = radiometry.linear_limits(level, black, white, models[i])
+        numbers[f"iso_{iso:g}"] = {
+            "source": measured.source,
+            "electrons_at_white": float(1 / measured.shot.mean()),
+            "read_noise_electrons": float(np.sqrt(measured.floor.mean()) / measured.shot.mean()),
+            "clip_dn": float(level.min()),
+        }
+    return models, limits, numbers
+
+
+def _transfer(
+    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], members: list[int], level: np.ndarray, step: float
+) -> Noise | None:
+    """Photon transfer over all neighbouring frames of one ISO."""
+    bins = []
+    for long, short in _neighbours(views, frames):
+        if long in members and short in members:
+            black = frame_black(frames[long])
+            limit = float(((level - black) * step).min()) - 0.02
+            a, b = _signal(frames[long], mosaics[long]), _signal(frames[short], mosaics[short])
+            label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
+            rough = (noise.assumed(frames[long].iso, 1 / step),) * 2
+            measured = exposure.measure_ratio(a, b, label, limit, rough)
+            if measured is not None:
+                bins += noise.transfer_bins(a, b, float(np.exp(measured[0])), limit, step)
+    return noise.from_transfer(bins, step)
+
+
+def _ratios(
+    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], models: list[Noise], limits: list[np.ndarray]
+) -> list[Ratio]:
+    """Measured exposure ratios of neighbouring frames."""
+    ratios = []
+    for long, short in _neighbours(views, frames):
+        a, b = _signal(frames[long], mosaics[long]), _signal(frames[short], mosaics[short])
+        label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
+        limit = float(min(limits[long].min(), limits[short].min()))
+        found = exposure.measure_ratio(a, b, label, limit, (models[long], models[short]))
+        if found is not None:
+            ratios.append(Ratio(long, short, *found))
+    return ratios
+
+
+def _exposures(
+    views: list[str], frames: list[Frame], ratios: list[Ratio], params: knobs.Merge, warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """ln(estimated / label) and its standard uncertainty, per frame; warns where labels are all there is."""
+    if not params.estimate_exposures:
+        return np.zeros(len(frames)), np.full(len(frames), exposure.LABEL_SIGMA)
+    speeds = [(frame.exposure_s, frame.iso, frame.fnumber) for frame in frames]
+    labels = np.array([exposure.exposure_of(frame) for frame in frames])
+    offsets, sigmas = exposure.solve_exposures(labels, speeds, ratios)
+    measured = {(ratio.long, ratio.short) for ratio in ratios}
+    for long, short in _neighbours(views, frames):
+        if (long, short) not in measured:
+            warnings.append(
+                f"{frames[short].file}, {frames[long].file}: no pixels well exposed in both; their ratio is the labels'"
+            )
+    for i in np.flatnonzero(np.abs(offsets) > LABEL_WARNING):
+        warnings.append(f"{frames[i].file}: exposure is {np.exp(offsets[i]):.3f} times its label; the estimate is used")
+    groups = exposure.linked_views(views, speeds, ratios)
+    linked = set().union(*(group for group in groups if "plate" in group)) if "plate" in views else set(views)
+    for view in sorted(set(views) - linked):
+        warnings.append(f"{view}: shares no exposure setting with the plate; its scale rests on labels (about 5 %)")
+    return offsets, sigmas
+
+
+def colour_profile(brackets: dict[str, Bracket], warnings: list[str]) -> dict[str, Any]:
+    """What develop needs to turn camera_rgb into ACEScg: one profile for all views, the plate's (else the first's).
+
+    Automatic white balance changes AsShotNeutral from frame to frame; plate and ball must not differ by it.
+    """
+    frames = [frame for bracket in brackets.values() for frame in _ordered(bracket.frames)]
+    first = _ordered(brackets["plate"].frames)[0] if "plate" in brackets else frames[0]
+    if first.as_shot_neutral is not None:
+        others = [frame.as_shot_neutral for frame in frames if frame.as_shot_neutral is not None]
+        if any(not np.allclose(other, first.as_shot_neutral, rtol=1e-3) for other in others):
+            warnings.append(f"white balance differs between frames; that of {first.file} is used for all views")
+    keys = ("camera", "color_matrix", "color_matrix_2", "illuminant", "illuminant_2", "as_shot_neutral")
+    dumped = first.model_dump(mode="json", include=set(keys))
+    return {"file": first.file, **{key: dumped[key] for key in keys}}
+
+
+def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:
+    """The artifact of one view: Y, variance, mask; CFA and colour profile in the header."""
+    channels = {"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask}
+    return Raster(channels, CAMERA_RGB, {"insitu:cfa": frame.cfa, "insitu:colour": json.dumps(profile)})
+
+
+def _view_numbers(merged: Merged, hot: int, frames: int) -> dict[str, Any]:
+    seen = np.isfinite(merged.variance)
+    bright = seen & (merged.mask & DARK == 0)
+    snr = merged.radiance[bright] / np.sqrt(merged.variance[bright])
+    return {
+        "frames": frames,
+        "clipped_fraction": float(np.mean(merged.mask & CLIPPED > 0)),
+        "dark_fraction": float(np.mean(merged.mask & DARK > 0)),
+        "ghost_fraction": float(np.mean(merged.mask & GHOST > 0)),
+        "negative_fraction": float(np.mean(merged.radiance < 0)),
+        "hot_pixels": hot,
+        "median_snr": float(np.median(snr)) if snr.size else 0.0,
+        "range_stops": _stops(merged.radiance[bright]),
+    }
+
+
+def _stops(radiance: np.ndarray) -> float:
+    """Dynamic range of the seen values, 0.1 to 99.99 %."""
+    if radiance.size < 2:
+        return 0.0
+    low, high = np.percentile(radiance, [0.1, 99.99])
+    return float(np.log2(high / low)) if low > 0 else 0.0
+
+
+def _warn_extremes(view: str, numbers: dict[str, Any], warnings: list[str]) -> None:
+    if numbers["clipped_fraction"] > 0.5:
+        share = f"{numbers['clipped_fraction']:.0%}"
+        warnings.append(f"{view}: {share} of the pixels clip in every frame; add a shorter exposure")
+    elif numbers["clipped_fraction"] > 0:
+        share = f"{numbers['clipped_fraction']:.3%}"
+        warnings.append(f"{view}: {share} of the pixels clip in the shortest frame; their values are lower bounds")
+    if numbers["dark_fraction"] > 0.5:
+        warnings.append(f"{view}: {numbers['dark_fraction']:.0%} of the pixels lie below noise; add a longer exposure")
+    if numbers["ghost_fraction"] > 0.01:
+        warnings.append(f"{view}: frames disagree in {numbers['ghost_fraction']:.1%} of the pixels; something moved")
+
+
+def _exposure_rows(
+    brackets: dict[str, Bracket],
+    views: list[str],
+    frames: list[Frame],
+    exposed: list[Exposed],
+    offsets: np.ndarray,
+    sigmas: np.ndarray,
+) -> dict[str, list[dict[str, Any]]]:
+    rows: dict[str, list[dict[str, Any]]] = {view: [] for view in brackets}
+    for view, frame, one, offset, sigma in zip(views, frames, exposed, offsets, sigmas):
+        limit = one.limit * (one.white - one.black) + one.black
+        clipped = [np.mean(one.mosaic[r::2, c::2] >= limit[r, c]) for r, c in np.ndindex(2, 2)]
+        rows[view].append(
+            {
+                "file": frame.file,
+                "label_s": frame.exposure_s,
+                "estimated_s": frame.exposure_s * float(np.exp(offset)),
+                "sigma_rel": float(sigma),
+                "iso": frame.iso,
+                "fnumber": frame.fnumber,
+                "clipped_fraction": float(np.mean(clipped)),
+            }
+        )
+    return rows
+
+
+def _shifts(views: list[str], exposed: list[Exposed]) -> dict[str, float]:
+    """Largest measured shift [px] between neighbouring frames of each view; views without structure are left out."""
+    shifts: dict[str, float] = {}
+    for index in range(len(exposed) - 1):
+        if views[index] == views[index + 1]:
+            shift = radiometry.measure_shift(exposed[index + 1], exposed[index])
+            if shift is not None:
+                shifts[views[index]] = max(shifts.get(views[index], 0.0), shift)
+    return shifts
+
+
+def _evidence(
+    models: list[Noise], ratios: list[Ratio], shifts: dict[str, float], numbers: dict[str, Any], warnings: list[str]
+) -> list[dict[str, Any]]:
+    moved = max(shifts.values(), default=0.0)
+    if moved > SHIFT_WARNING_PX:
+        warnings.append(f"frames of a view are shifted by up to {moved:.2f} px and are not aligned; use a tripod")
+    ghosts = max((n["ghost_fraction"] for n in numbers.values()), default=0.0)
+    sources = sorted({model.source for model in models})
+    return [
+        {
+            "term": "noise model",
+            "modelled": sources != ["assumed"],
+            "because": f"source: {', '.join(sources)}",
+            "could_cost": "weights and variances off; radiance stays unbiased",
+        },
+        {
+            "term": "exposure errors",
+            "modelled": bool(ratios),
+            "because": f"{len(ratios)} ratios measured between frames",
+            "could_cost": "up to 7 % between parts of the range that different frames cover",
+        },
+        {
+            "term": "alignment of frames",
+            "modelled": False,
+            "because": f"largest shift between neighbouring frames {moved:.3f} px"
+            if shifts
+            else "no structure to measure it",
+            "could_cost": f"blur of {moved:.3f} px",
+        },
+        {
+            "term": "motion between frames",
+            "modelled": False,
+            "because": f"chi-square beyond noise in {ghosts:.3%} of the pixels of the worst view; flagged, variance raised",
+            "could_cost": "a mixture of states in flagged pixels",
+        },
+    ]
+
+
+STAGE = Stage(
+    "merge",
+    compute,
+    knobs.Merge,
+    inputs={"facts": FACTS, "brackets": BRACKETS},
+    outputs={"mosaics": MOSAICS, "exposures": EXPOSURES},
+)
