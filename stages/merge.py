@@ -325,7 +325,7 @@ def _evidence(
         {
             "term": "motion between frames",
             "modelled": False,
-            "because": f"chi-square beyond noise in {ghosts:.3%} of the pixels of the worst view; flagged, variance raised",
+            "because": f"chi-square beyond noise in {ghosts:.3%} of the worst view; flagged, variance raised",
             "could_cost": "a mixture of states in flagged pixels",
         },
     ]

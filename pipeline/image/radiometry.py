@@ -106,11 +106,7 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
 
     ordered = sorted(frames, key=lambda f: (f.exposure, f.mosaic.tobytes() if _tied(f, frames) else b""))
     height, width = ordered[0].mosaic.shape
-    result = Merged(
-        np.empty((height, width), np.float32),
-        np.empty((height, width), np.float32),
-        np.zeros((height, width), np.uint32),
-    )
+    result = Merged(*(np.empty((height, width), dtype) for dtype in (np.float32, np.float32, np.uint32)))
 
     def work(tile: tuple[slice, slice, slice]) -> None:
         outer, inner, target = tile
@@ -138,41 +134,51 @@ def _tiles(height: int) -> Iterator[tuple[slice, slice, slice]]:
 def _merge_rows(frames: Sequence[Exposed], rows: slice, weights: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Radiance, variance and mask of some rows; frames sorted from the shortest."""
     signals = [frame.signal(rows) for frame in frames]
-    used = [_usable(frame, signal, first=i == 0) for i, (frame, signal) in enumerate(zip(frames, signals))]
     shape = signals[0].shape
-    shots = [tiled(frame.noise.shot, shape) for frame in frames]
-    floors = [tiled(frame.noise.floor, shape) for frame in frames]
-    # weights are per radiance: w_i of the module's text
-    weight = [use * (np.float32(f.exposure) / shot) for use, f, shot in zip(used, frames, shots)]
+    used = [_usable(frame, signal, first=i == 0) for i, (frame, signal) in enumerate(zip(frames, signals))]
+    weight = [use * (np.float32(frame.exposure) / tiled(frame.noise.shot, shape)) for use, frame in zip(used, frames)]
     numerator, total = _sums(frames, signals, weight)
     if weights == "optimal":
         around = np.maximum(_ratio(_around(numerator), _around(total)), 0)
-        for i, frame in enumerate(frames):
-            g = np.float32(frame.exposure)
-            weight[i] = used[i] * (g * g / (shots[i] * g * around + floors[i]))
+        weight = [use / _variance(frame, around) for use, frame in zip(used, frames)]
         numerator, total = _sums(frames, signals, weight)
     seen = total > 0
     radiance = _ratio(numerator, total)
-    level = np.maximum(radiance, 0)
-    spread, chi2, count = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    for i, frame in enumerate(frames):
-        g = np.float32(frame.exposure)
-        noise = shots[i] * g * level + floors[i]
-        spread += weight[i] * weight[i] * (noise / (g * g))
-        if len(frames) > 1:
-            expected = g * radiance
-            misfit = np.where(used[i], signals[i] - expected, 0)
-            chi2 += misfit * misfit / (noise + (np.float32(RATIO_ERROR) * expected) ** 2)
-            count += used[i]
-    variance = _ratio(spread, total * total)
+    variance, ghost = _spread(frames, signals, used, weight, radiance, total)
     mask = np.where(seen, 0, CLIPPED).astype(np.uint32)
-    if len(frames) > 1:
-        ghost = (count > 1) & (chi2 > _chi2_limit(count - 1))
-        variance = np.where(ghost, variance * chi2 / np.maximum(count - 1, 1), variance)
-        mask |= np.where(ghost, np.uint32(GHOST), np.uint32(0))
+    mask |= np.where(ghost, np.uint32(GHOST), np.uint32(0))
     mask |= np.where(seen & (radiance < np.sqrt(variance)), np.uint32(DARK), np.uint32(0))
     bound = np.fmax(signals[0], tiled(frames[0].limit, shape)) / np.float32(frames[0].exposure)
     return np.where(seen, radiance, bound), np.where(seen, variance, np.float32(np.inf)), mask
+
+
+def _variance(frame: Exposed, radiance: np.ndarray) -> np.ndarray:
+    """Variance of one frame's estimate of a radiance (h, W) that is not negative."""
+    g, shape = np.float32(frame.exposure), radiance.shape
+    return tiled(frame.noise.shot, shape) / g * radiance + tiled(frame.noise.floor, shape) / (g * g)
+
+
+def _spread(
+    frames: Sequence[Exposed],
+    signals: list[np.ndarray],
+    used: list[np.ndarray],
+    weight: list[np.ndarray],
+    radiance: np.ndarray,
+    total: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance of the weighted mean, and where the frames disagree beyond it; there the variance is what they show."""
+    level = np.maximum(radiance, 0)
+    spread, chi2, count = (np.zeros_like(radiance) for _ in range(3))
+    for frame, signal, use, w in zip(frames, signals, used, weight):
+        noise = _variance(frame, level)
+        spread += w * w * noise
+        if len(frames) > 1:
+            misfit = np.where(use, signal / np.float32(frame.exposure) - radiance, 0)
+            chi2 += misfit * misfit / (noise + (np.float32(RATIO_ERROR) * level) ** 2)
+            count += use
+    variance = _ratio(spread, total * total)
+    ghost = (count > 1) & (chi2 > _chi2_limit(count - 1))
+    return np.where(ghost, variance * chi2 / np.maximum(count - 1, 1), variance), ghost
 
 
 def _sums(
@@ -274,11 +280,12 @@ def _outliers(radiance: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, n
         np.maximum(high, view, out=high)
         np.minimum(low, view, out=low)
     reach = HOT_SIGMA * np.sqrt(variance)  # infinite where clipped: never an outlier
-    return np.nonzero((radiance > high + reach) | (radiance < low - reach))
+    found = np.nonzero((radiance > high + reach) | (radiance < low - reach))
+    return found[0], found[1]
 
 
 def _excess(radiance: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Value less the median of the same-colour neighbours, that median, and the neighbours' variance, at some pixels."""
+    """At some pixels: value less the median of the same-colour neighbours, that median, the neighbours' variance."""
     height, width = radiance.shape
     around = np.stack(
         [radiance[_mirror(rows + dy, height), _mirror(columns + dx, width)] for dy, dx in NEIGHBOURS]
