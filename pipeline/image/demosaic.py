@@ -1,0 +1,119 @@
+"""Demosaicking of a Bayer mosaic in float, with the variance carried through the same kernels.
+
+The picture is taken apart into the four planes of its 2x2 cell; a kernel is then a few shifted sums of planes, at a
+quarter of the size, and the squared kernel gives the exact variance of an output whose samples are independent.
+
+bilinear  mean of the nearest samples of the colour.
+malvar    Malvar, He, Cutler 2004: bilinear plus the Laplacian of the colour that is there, 5x5.
+menon     Menon, Andriani, Calvagno 2007, from colour-demosaicing; it chooses directions and is not linear: its variance
+          is bilinear's: right in flat parts, an estimate at edges.
+
+Limits: none of them knows about clipping; the caller masks what a kernel touched (`REACH`).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+Method = Literal["bilinear", "malvar", "menon"]
+Kernel = dict[tuple[int, int], float]  # (dy, dx) -> coefficient
+
+REACH: dict[str, int] = {"bilinear": 1, "malvar": 2, "menon": 3}  # pixels around an output that can enter it
+PAD = 4  # photosites of mirrored border, even, at least the reach of a kernel
+
+
+def _kernel(rows: list[list[float]], scale: float) -> Kernel:
+    half = len(rows) // 2
+    return {
+        (y - half, x - half): value / scale for y, row in enumerate(rows) for x, value in enumerate(row) if value != 0
+    }
+
+
+_CROSS = _kernel([[0, 1, 0], [1, 0, 1], [0, 1, 0]], 4)
+_CORNERS = _kernel([[1, 0, 1], [0, 0, 0], [1, 0, 1]], 4)
+_BESIDE = _kernel([[0, 0, 0], [1, 0, 1], [0, 0, 0]], 2)
+_ABOVE = _kernel([[0, 1, 0], [0, 0, 0], [0, 1, 0]], 2)
+_SELF: Kernel = {(0, 0): 1.0}
+
+# Malvar, He, Cutler 2004, figure 2.
+_MALVAR_GREEN = _kernel([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]], 8)
+_MALVAR_BESIDE = _kernel(
+    [[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]], 8
+)
+_MALVAR_ABOVE: Kernel = {(dx, dy): value for (dy, dx), value in _MALVAR_BESIDE.items()}
+_MALVAR_CORNERS = _kernel(
+    [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]], 8
+)
+
+# (green at a red or blue site, colour beside a green site, colour above and below it, red at blue or blue at red)
+_SETS: dict[str, tuple[Kernel, Kernel, Kernel, Kernel]] = {
+    "bilinear": (_CROSS, _BESIDE, _ABOVE, _CORNERS),
+    "malvar": (_MALVAR_GREEN, _MALVAR_BESIDE, _MALVAR_ABOVE, _MALVAR_CORNERS),
+}
+
+
+def kernel_for(method: str, cfa: str, colour: str, row: int, column: int) -> Kernel:
+    """The kernel that gives ``colour`` at the photosite (row, column) of the 2x2 cell ``cfa``."""
+    here = cfa[2 * row + column]
+    green, beside, above, corners = _SETS[method]
+    if here == colour:
+        return _SELF
+    if colour == "G":
+        return green
+    if here == "G":
+        return beside if cfa[2 * row + 1 - column] == colour else above
+    return corners
+
+
+def demosaic(mosaic: np.ndarray, cfa: str, method: Method) -> np.ndarray:
+    """(H, W, 3) float32 of an (H, W) mosaic, whose colours are best white balanced before."""
+    if method == "menon":
+        from colour_demosaicing import demosaicing_CFA_Bayer_Menon2007
+
+        return np.asarray(demosaicing_CFA_Bayer_Menon2007(np.asarray(mosaic, float), cfa), np.float32)
+    return _apply(mosaic, cfa, method, power=1)
+
+
+def demosaic_variance(variance: np.ndarray, cfa: str, method: Method) -> np.ndarray:
+    """(H, W, 3) float32 variance of `demosaic`, for samples that are independent and finite."""
+    return _apply(variance, cfa, "bilinear" if method == "menon" else method, power=2)
+
+
+def _apply(mosaic: np.ndarray, cfa: str, method: str, power: int) -> np.ndarray:
+    """Every kernel, its coefficients to the ``power``, on the planes of the padded mosaic."""
+    height, width = mosaic.shape
+    # mirroring about the outermost sample keeps each photosite's colour
+    padding = ((PAD, PAD + height % 2), (PAD, PAD + width % 2))
+    padded = _pad_cells(np.asarray(mosaic, np.float32), padding)
+    planes = {(r, c): np.ascontiguousarray(padded[r::2, c::2]) for r in (0, 1) for c in (0, 1)}
+    rows, columns = (height + 1) // 2, (width + 1) // 2
+    result = np.empty((2 * rows, 2 * columns, 3), np.float32)
+    for channel, colour in enumerate("RGB"):
+        for r, c in np.ndindex(2, 2):
+            total = np.zeros((rows, columns), np.float32)
+            for (dy, dx), value in kernel_for(method, cfa, colour, r, c).items():
+                top, left = (r + dy) // 2 + PAD // 2, (c + dx) // 2 + PAD // 2
+                plane = planes[(r + dy) % 2, (c + dx) % 2]
+                total += np.float32(value**power) * plane[top : top + rows, left : left + columns]
+            result[r::2, c::2, channel] = total
+    return result[:height, :width]
+
+
+def _pad_cells(values: np.ndarray, padding: tuple[tuple[int, int], tuple[int, int]]) -> np.ndarray:
+    """Mirrored border; pictures too small to mirror repeat their cells."""
+    return np.pad(values, padding, mode="reflect" if min(values.shape) > max(max(padding)) else "wrap")
+
+
+def dilate(mask: np.ndarray, reach: int) -> np.ndarray:
+    """(H, W) bits, each spread over the square of ``reach`` pixels around."""
+    result = mask.copy()
+    for axis in (0, 1):
+        source = result.copy()
+        for step in range(1, reach + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            result[tuple(ahead)] |= source[tuple(behind)]
+            result[tuple(behind)] |= source[tuple(ahead)]
+    return result
