@@ -58,9 +58,9 @@ def compute(
         normal=np.array([0.0, 1.0, 0.0]), offset_m=0.0, covariance=covariance, corners_m=corners, source=view.route,
         contact_sigma_px=max(contact.values(), default=0.0),
     )  # fmt: skip
-    sigma = np.sqrt(np.diag(covariance))
+    deviations = np.sqrt(np.diag(covariance))
     numbers = {
-        "normal_sigma_deg": float(np.degrees(np.hypot(sigma[0], sigma[1]))), "offset_sigma_m": float(sigma[2]),
+        "normal_sigma_deg": float(np.degrees(np.hypot(deviations[0], deviations[1]))), "offset_sigma_m": float(deviations[2]),
         "contact_sigma_px": contact, "camera_height_m": height, "object_size_assumed_m": size,
         "rectangle_m": [float(corners[:, 0].min()), float(corners[:, 2].min()),
                         float(corners[:, 0].max()), float(corners[:, 2].max())],

@@ -306,6 +306,11 @@ def figures(
             "distance_m": distance, "corner_sigma_px": estimate.best.sigma_px,
             "outliers": int((~estimate.best.kept).sum()), "position_sigma_rel": numbers["position_sigma_m"] / distance,
         }  # fmt: skip
+    if estimate is not None and estimate.best.frontal:
+        warnings.append(
+            f"{name}: the {view.route} is seen so squarely that its tilt is hardly known ({rotation_deg:.2f} deg); "
+            "tilt it by 30 deg against the camera"
+        )
     if rotation_deg > WIDE_ROTATION_DEG:
         warnings.append(
             f"{name}: rotation is known to {rotation_deg:.1f} deg only; show the marker larger or more tilted"

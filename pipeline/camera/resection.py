@@ -7,12 +7,12 @@ are refined and compared.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.camera.lens import project_jacobians, unproject
-from pipeline.camera.rigid import camera_points, difference, perturb, plane_frame
+from pipeline.camera.rigid import camera_points, difference, perturb, plane_frame, rotation_exp
 from pipeline.conventions import invert_rigid
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
@@ -20,6 +20,7 @@ from pipeline.types import Camera
 HUBER = 2.0  # residuals beyond this many sigma lose weight while searching
 GATE = 5.0  # and beyond this many are left out of the final fit
 GATE_POINTS = 8  # with fewer points an outlier cannot be told from a bad pose
+FRONTAL = 3.0  # tilts below this many of their own sigma (seen squarely) are not Gaussian
 FLAT = 1e-3  # points whose least extent is below this fraction of the largest are one plane
 
 
@@ -35,6 +36,7 @@ class Resection:
     kept: np.ndarray  # (N,) bool
     sigma_px: float  # uncertainty of one coordinate that the covariance assumes
     chi2: float  # of the kept residuals in units of the stated corner sigma
+    frontal: bool = False  # the plane is seen so squarely that its tilt is hardly known; the covariance is widened
 
     @property
     def rms_px(self) -> float:
@@ -59,7 +61,10 @@ def robust_scale(residuals: np.ndarray) -> float:
 def minimise(
     camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray, huber_px: float = np.inf
 ) -> np.ndarray:
-    """Levenberg-Marquardt on the pose (4, 4), Huber cost. Returns the pose; a start that fits nothing comes back."""
+    """Levenberg-Marquardt on the pose (4, 4), Huber cost. Returns the pose; a start that fits nothing comes back.
+
+    A search with a finite ``huber_px`` only prepares the gate and ends early.
+    """
 
     def evaluate(candidate: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         residuals, jacobian, _ = residuals_and_jacobian(camera, candidate, world_points, px)
@@ -79,7 +84,7 @@ def minimise(
         candidate = perturb(pose, step)
         new_cost, *rest = evaluate(candidate)
         if new_cost <= cost:
-            done = cost - new_cost <= 1e-12 * cost + 1e-18
+            done = cost - new_cost <= (1e-12 if np.isinf(huber_px) else 1e-5) * cost + 1e-18
             pose, cost, damping = candidate, new_cost, max(damping * 0.1, 1e-12)
             weight, residuals, jacobian = rest
             if done:
@@ -168,15 +173,46 @@ def resect_plane(
     candidates.sort(key=lambda c: robust_cost(c.residuals_px, sigma_px))
     best = candidates[0]
     if len(candidates) == 1:
-        return best, None, np.inf
+        return widened(camera, world_points, best), None, np.inf
     second = refine(camera, candidates[1].world_from_camera, world_points, px, sigma_px, best.kept)
     if second.chi2 < best.chi2:
         best, second = second, refine(camera, best.world_from_camera, world_points, px, sigma_px, best.kept)
     apart = difference(second.world_from_camera, best.world_from_camera)
     if apart @ np.linalg.solve(best.covariance, apart) < 1:
-        return best, None, np.inf
+        return widened(camera, world_points, best), None, np.inf
     freedom = max(2 * int(best.kept.sum()) - 6, 1)
-    return best, second, float(second.chi2 / max(best.chi2, freedom))
+    return widened(camera, world_points, best), second, float(second.chi2 / max(best.chi2, freedom))
+
+
+def widened(camera: Camera, world_points: np.ndarray, best: Resection) -> Resection:
+    """The same pose with an honest covariance when the plane is seen almost squarely; else unchanged.
+
+    Foreshortening tells the tilt only to second order there, and its linearisation at an estimate that noise has tilted
+    promises too much. Taken instead: the covariance at the untilted pose, plus the way to the mirrored one.
+    """
+    pose, centre = best.world_from_camera, world_points.mean(0)
+    arm = pose[:3, 3] - centre
+    towards = arm / np.linalg.norm(arm)
+    normal = plane_frame(world_points)[0][:3, 2]
+    normal = normal if normal @ towards > 0 else -normal
+    axis = np.cross(towards, normal)
+    sine = float(np.linalg.norm(axis))
+    tilt = np.arctan2(sine, normal @ towards)
+    turn = rotation_exp(axis / max(sine, 1e-300) * tilt)
+    square = np.eye(4)
+    square[:3, :3], square[:3, 3] = turn @ pose[:3, :3], centre + turn @ arm
+    _, jacobian, _ = residuals_and_jacobian(camera, square, world_points, np.zeros((len(world_points), 2)))
+    flat = jacobian[best.kept].reshape(-1, 6)
+    if not np.isfinite(flat).all():
+        return best
+    back = np.kron(np.eye(2), turn.T)
+    untilted = back @ (best.sigma_px**2 * np.linalg.inv(flat.T @ flat)) @ back.T
+    if tilt > FRONTAL * np.sqrt(np.linalg.eigvalsh(untilted[:3, :3])[-1]):
+        return best
+    mirrored = 2 * difference(square, pose)
+    noise = untilted + np.outer(mirrored, mirrored)
+    covariance = best.covariance - best.noise_covariance + noise
+    return replace(best, covariance=covariance, noise_covariance=noise, frontal=True)
 
 
 def robust_cost(residuals: np.ndarray, sigma_px: float) -> float:
