@@ -1,0 +1,26 @@
+"""Bilinear lookup of many channels at sub-pixel positions; the second place that imports cv2 (for its speed only)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.conventions import HALF_PIXEL
+
+
+def planes(picture: np.ndarray) -> list[np.ndarray]:
+    """A picture (H, W, C) or (H, W) as float32 groups of at most four channels, as `bilinear` wants it: split once."""
+    picture = np.asarray(picture, np.float32)
+    picture = picture[..., None] if picture.ndim == 2 else picture
+    return [np.ascontiguousarray(picture[..., i : i + 4]) for i in range(0, picture.shape[2], 4)]
+
+
+def bilinear(groups: list[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values (N, M, C) float32 of a picture split by `planes` at pixels ``x, y`` (N, M), first centre (0.5, 0.5).
+
+    OpenCV rounds positions to 1/32 px; beyond the outermost centres the border is repeated.
+    """
+    import cv2
+
+    map_x, map_y = np.float32(x) - np.float32(HALF_PIXEL), np.float32(y) - np.float32(HALF_PIXEL)
+    found = [cv2.remap(group, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for group in groups]
+    return np.concatenate([f.reshape(*x.shape, -1) for f in found], -1)

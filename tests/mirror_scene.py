@@ -1,0 +1,111 @@
+"""A mirror ball photographed in a known place: a forward ray tracer in numpy, sharing no code with the unwrap.
+
+Only the lens of `pipeline.camera` is shared (it has tests of its own). Rays go pixel -> lens -> ball -> plane or sky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.camera.lens import unproject
+from pipeline.types import Camera
+
+Light = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass
+class Lamp:
+    """A disc of constant radiance in a direction."""
+
+    direction: tuple[float, float, float]
+    half_angle: float
+    radiance: float
+
+
+def sky(lamps: list[Lamp], contrast: float = 1.0) -> Light:
+    """Directions (N, 3) -> RGB: a smooth room with walls of different colour, and lamps."""
+
+    def light(w: np.ndarray) -> np.ndarray:
+        x, y, z = w.T
+        room = 1 + contrast * np.stack(
+            [0.5 * x + 0.2 * np.sin(3 * z), 0.4 * y + 0.3 * x * z, 0.3 * y - 0.3 * np.cos(4 * x)], -1
+        )
+        room = np.maximum(room, 0.05)
+        for lamp in lamps:
+            centre = np.asarray(lamp.direction) / np.linalg.norm(lamp.direction)
+            room = np.where((w @ centre > np.cos(lamp.half_angle))[:, None], lamp.radiance, room)
+        return room
+
+    return light
+
+
+@dataclass
+class Place:
+    """World: +Y up; the plane y = 0 with a chequered board in front of the far light, or no plane at all."""
+
+    light: Light
+    plane: bool = False
+    ball: tuple[float, float, float] | None = (0.0, 0.04, 0.0)
+    radius: float = 0.04
+    reflectance: float = 0.8
+
+    def radiance(self, origin: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """RGB (N, 3) seen from ``origin`` (N, 3) along ``w`` (N, 3), the ball left out."""
+        rgb = self.light(w)
+        if self.plane:
+            below = w[:, 1] < -1e-9
+            t = np.where(below, -origin[:, 1] / np.where(below, w[:, 1], 1), 0)
+            x, z = (origin + t[:, None] * w)[:, ::2].T
+            wood = 0.5 + 0.06 * np.sin(40 * x + 3 * np.sin(9 * z)) + 0.05 * np.sin(160 * z)
+            board = (x > 0.1) & (x < 0.3) & (np.abs(z) < 0.1)
+            check = np.where((np.floor(x / 0.03) + np.floor(z / 0.03)) % 2 > 0, 0.9, 0.08)
+            value = np.where(board, check, wood)
+            rgb = np.where(below[:, None], value[:, None] * (1.0, 0.9, 0.8), rgb)
+        return rgb
+
+    def traced(self, origin: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """RGB (N, 3) with the ball in place."""
+        if self.ball is None:
+            return self.radiance(origin, w)
+        to_ball = np.asarray(self.ball) - origin
+        along = (to_ball * w).sum(1)
+        inside = self.radius**2 - (to_ball**2).sum(1) + along**2
+        hit = (inside > 0) & (along > 0)
+        rgb = np.empty_like(w)
+        rgb[~hit] = self.radiance(origin[~hit], w[~hit])
+        point = origin[hit] + (along[hit] - np.sqrt(inside[hit]))[:, None] * w[hit]
+        normal = (point - self.ball) / self.radius
+        mirrored = w[hit] - 2 * (w[hit] * normal).sum(1, keepdims=True) * normal
+        rgb[hit] = self.reflectance * self.radiance(point, mirrored)
+        return rgb
+
+
+def look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+    """world_from_camera (4, 4): z forward, y down."""
+    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    right = np.cross(forward, (0, 1, 0))
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def photograph(
+    place: Place, camera: Camera, world_from_camera: np.ndarray, split: int = 4, noise: float = 0.0, seed: int = 0
+) -> np.ndarray:
+    """(H, W, 3): box-filtered pixels of ``split**2`` rays each, with relative Gaussian noise."""
+    steps = (np.arange(split) + 0.5) / split
+    total = np.zeros((camera.height * camera.width, 3))
+    y, x = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
+    for dy in steps:
+        for dx in steps:
+            xy = unproject(camera, np.stack([(x + dx).ravel(), (y + dy).ravel()], -1))
+            rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ world_from_camera[:3, :3].T
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            total += place.traced(np.broadcast_to(world_from_camera[:3, 3], rays.shape), rays)
+    picture = (total / split**2).reshape(camera.height, camera.width, 3)
+    return picture * (1 + noise * np.random.default_rng(seed).normal(size=picture.shape))
