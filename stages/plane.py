@@ -60,7 +60,8 @@ def compute(
     )  # fmt: skip
     deviations = np.sqrt(np.diag(covariance))
     numbers = {
-        "normal_sigma_deg": float(np.degrees(np.hypot(deviations[0], deviations[1]))), "offset_sigma_m": float(deviations[2]),
+        "normal_sigma_deg": float(np.degrees(np.hypot(deviations[0], deviations[1]))),
+        "offset_sigma_m": float(deviations[2]),
         "contact_sigma_px": contact, "camera_height_m": height, "object_size_assumed_m": size,
         "rectangle_m": [float(corners[:, 0].min()), float(corners[:, 2].min()),
                         float(corners[:, 0].max()), float(corners[:, 2].max())],

@@ -10,6 +10,8 @@ such points project to NaN and such pixels are refused. Pixels: first centre (0.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from pipeline.run.errors import NumericalError
@@ -21,7 +23,11 @@ BLOCK = 1 << 15  # pixels per block of the ray grid: its temporaries stay in the
 
 def fold_radius_squared(distortion: np.ndarray) -> float:
     """Smallest squared radius of undistorted coordinates where the radial curve stops growing; inf if never."""
-    k1, k2, _, _, k3 = distortion
+    return _fold(*(float(k) for k in np.asarray(distortion)[[0, 1, 4]]))
+
+
+@functools.lru_cache(maxsize=64)
+def _fold(k1: float, k2: float, k3: float) -> float:
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))].real
     return float(min(real[real > 0], default=np.inf))

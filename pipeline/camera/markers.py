@@ -17,7 +17,7 @@ from pipeline.types import Camera
 
 AP1_LUMINANCE = (0.2722287168, 0.6740817658, 0.0536895174)  # ACES TB-2014-004, second row of AP1 to XYZ
 SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)  # corners in ArUco's order, y down the print
-PROFILES, SAMPLES = 48, 33
+PROFILES, SAMPLES = 200, 33  # profiles nearer than a pixel: wider ones beat with the pixel grid
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
@@ -131,7 +131,7 @@ def _edge(
     for _ in range(3):
         slope, level = np.polyfit(place[good], offset[good], 1)
         error = np.abs(offset - (slope * place + level))
-        good = error <= max(3 * 1.4826 * float(np.median(error[good])), 1e-6)
+        good = error <= max(3 * 1.4826 * float(np.median(error[good])), 0.1 / across_px)
     normal = outward - slope * along
     return np.append(normal, normal @ (start + level * outward))
 
