@@ -161,9 +161,7 @@ def acescg_from_camera(
     ``as_shot_neutral`` the scene's white is taken as D65. Raises CaptureError without a usable ColorMatrix.
     """
     if color_matrix is None or abs(np.linalg.det(color_matrix)) < 1e-6:
-        raise CaptureError(
-            f"{where}: no usable ColorMatrix1 in the RAW file, needed for ACEScg; convert the file to DNG"
-        )
+        raise CaptureError(f"{where}: no usable ColorMatrix1 in the RAW, needed for ACEScg; convert the file to DNG")
     neutral = as_shot_neutral
     if neutral is None:
         neutral = color_matrix @ xyz_of_xy(REC709_CHROMATICITIES[3])
@@ -174,7 +172,7 @@ def acescg_from_camera(
     current, white = camera_white(color_matrix, neutral, color_matrix_2, illuminant, illuminant_2)
     if not np.all(white > 0):
         raise CaptureError(
-            f"{where}: ColorMatrix1 maps the neutral to XYZ {white.round(4).tolist()}; not a colour, fix it"
+            f"{where}: ColorMatrix1 maps the neutral to XYZ {white.round(4).tolist()}; no colour, fix it"
         )
     to_aces = adaptation(white, xyz_of_xy(ACESCG_CHROMATICITIES[3])) / white[1]
     return _from_xyz("acescg") @ to_aces @ np.linalg.inv(current)

@@ -78,10 +78,8 @@ def read_mosaic(path: Path, frame: Frame) -> np.ndarray:
     if mosaic.shape != (frame.height, frame.width):
         found = f"{mosaic.shape[1]} x {mosaic.shape[0]}"
         raise CaptureError(f"{frame.file}: decodes to {found}, metadata say {frame.width} x {frame.height}; copy again")
-    if mosaic.min() == mosaic.max():
-        raise CaptureError(
-            f"{frame.file}: every pixel is {mosaic.flat[0]}; the RAW data are missing, copy the file again"
-        )
+    if mosaic.min() == mosaic.max() < frame.white:  # all at white is a clipped frame, which merge can tell
+        raise CaptureError(f"{frame.file}: every pixel is {mosaic.flat[0]}, so its RAW data are missing; copy it again")
     return mosaic
 
 
