@@ -6,7 +6,7 @@ Read from a ``truth.json`` (only `stages/evaluate.py` opens it, after everything
     root        folder of the files; default: that of truth.json; environment variables expand
     plate       EXR; with_objects: EXR
     coverage    EXR with one float channel per object, or PNG whose R, G, B are ``coverage_names``
-    albedo      EXR, optional: R G B and ``seen``, of the plane as the plate camera sees it
+    albedo      EXR, optional: R G B and ``seen``, of the plane as the plate camera sees it, or PNG ``albedo_seen``
     environment {"file", "world_from_map"}: lat-long, formula of conventions; 3x3 rotation of its directions to world
     camera      {width height fx fy cx cy distortion}, first pixel centre (0.5, 0.5)
     views       {name: {"world_from_camera": 4x4}}
@@ -75,7 +75,7 @@ def load_truth(path: Path) -> Truth:
         plate=plate,
         with_objects=with_objects,
         coverage=coverage,
-        albedo=_albedo(folder / facts["albedo"], space) if facts.get("albedo") else None,
+        albedo=_albedo(folder, facts, space) if facts.get("albedo") else None,
         environment=picture(light["file"]) if light else None,
         world_from_map=np.asarray(light.get("world_from_map", np.eye(3)) if light else np.eye(3), float),
         camera=facts.get("camera", {}),
@@ -93,9 +93,12 @@ def _coverage(file: Path, names: list[str] | None, path: Path) -> dict[str, np.n
     return {name: mask[..., i] for i, name in enumerate(names)}
 
 
-def _albedo(file: Path, space: Space) -> np.ndarray:
-    raster = formats.read_exr(file)
+def _albedo(folder: Path, facts: dict[str, Any], space: Space) -> np.ndarray:
+    raster = formats.read_exr(folder / facts["albedo"])
     seen = raster.channels.get("seen", np.ones(raster.shape, np.float32))
+    if "albedo_seen" in facts:
+        mask = formats.read_png(folder / facts["albedo_seen"])
+        seen = (mask / np.iinfo(mask.dtype).max).astype(np.float32).reshape(*raster.shape, -1)[..., 0]
     return np.concatenate([convert(raster.rgb(), space, "acescg"), seen[..., None]], -1)
 
 
