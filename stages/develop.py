@@ -44,7 +44,7 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
         if profile["color_matrix_2"] is None:
             evidence.append(_one_matrix(profile))
         break  # merge gives all views one profile
-    return Result({"photographs": photographs}, numbers, warnings, evidence)
+    return Result({"photographs": photographs}, {"views": numbers}, warnings, evidence)
 
 
 def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:

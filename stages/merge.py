@@ -72,7 +72,7 @@ def merge_brackets(brackets: dict[str, Bracket], decode: Callable[[Frame], np.nd
     shifts = _shifts(views, exposed)
     evidence = _evidence(models, ratios, shifts, numbers, warnings)
     totals = {"noise": noise_numbers, "ratios_measured": len(ratios), "shift_px": max(shifts.values(), default=0.0)}
-    return Result({"mosaics": rasters, "exposures": listing}, {**numbers, **totals}, warnings, evidence)
+    return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
 
 
 def _ordered(frames: list[Frame]) -> list[Frame]:
@@ -111,33 +111,53 @@ def _noise_models(
     groups: dict[tuple[str, float, float], list[int]] = {}
     for index, frame in enumerate(frames):
         groups.setdefault((frame.camera, frame.iso, frame.white), []).append(index)
-    models: list[Noise] = [noise.assumed(frame.iso, frame.white) for frame in frames]
-    limits: list[np.ndarray] = [np.ones((2, 2))] * len(frames)
-    numbers: dict[str, Any] = {}
-    for (_, iso, white), members in groups.items():
+    levels, measured = {}, {}
+    for key, members in groups.items():
         black = frame_black(frames[members[0]])
-        step = 1 / (white - float(black.mean()))
-        level = radiometry.clip_levels([mosaics[i] for i in members], white, black)
+        step = 1 / (key[2] - float(black.mean()))
+        levels[key] = radiometry.clip_levels([mosaics[i] for i in members], key[2], black)
+        found = noise.from_profile(frames[members[0]]) or _transfer(views, frames, mosaics, members, levels[key], step)
+        if found is not None:
+            measured[key] = found
+    models: dict[int, Noise] = {}
+    limits: dict[int, np.ndarray] = {}
+    numbers: dict[str, Any] = {}
+    for key, members in groups.items():
+        _, iso, white = key
+        black, level = frame_black(frames[members[0]]), levels[key]
         if np.any(level < white):
-            warnings.append(
-                f"ISO {iso:g}: frames clip at {level.min():.0f} DN, metadata say {white:.0f}; the lower is used"
-            )
-        measured = noise.from_profile(frames[members[0]]) or _transfer(views, frames, mosaics, members, level, step)
-        if measured is None:
-            measured = noise.assumed(iso, white - float(black.mean()))
-            warnings.append(
-                f"ISO {iso:g}: no NoiseProfile and too few frames to measure noise; a usual sensor is assumed"
-            )
+            warnings.append(f"ISO {iso:g}: frames clip at {level.min():.0f} DN, not at {white:.0f} as metadata say")
+        model = measured.get(key) or _borrowed(key, measured, white - float(black.mean()), warnings)
         for i in members:
-            models[i] = noise.from_profile(frames[i]) or measured
+            models[i] = noise.from_profile(frames[i]) or model
             limits[i] = radiometry.linear_limits(level, black, white, models[i])
         numbers[f"iso_{iso:g}"] = {
-            "source": measured.source,
-            "electrons_at_white": float(1 / measured.shot.mean()),
-            "read_noise_electrons": float(np.sqrt(measured.floor.mean()) / measured.shot.mean()),
+            "source": model.source,
+            "electrons_at_white": float(1 / model.shot.mean()),
+            "read_noise_electrons": float(np.sqrt(model.floor.mean()) / model.shot.mean()),
             "clip_dn": float(level.min()),
         }
-    return models, limits, numbers
+    order = range(len(frames))
+    return [models[i] for i in order], [limits[i] for i in order], numbers
+
+
+def _borrowed(
+    key: tuple[str, float, float],
+    measured: dict[tuple[str, float, float], Noise],
+    full_scale_dn: float,
+    warnings: list[str],
+) -> Noise:
+    """Noise of an ISO that could not be measured: scaled from another ISO of the camera, else assumed."""
+    camera, iso, _ = key
+    others = sorted((other for other in measured if other[0] == camera), key=lambda other: abs(np.log(other[1] / iso)))
+    if others:
+        gain, source = iso / others[0][1], measured[others[0]]
+        warnings.append(
+            f"ISO {iso:g}: noise scaled from ISO {others[0][1]:g}, for want of NoiseProfile and frame pairs"
+        )
+        return Noise(source.shot * gain, source.floor * gain**2, f"scaled from ISO {others[0][1]:g}")
+    warnings.append(f"ISO {iso:g}: no NoiseProfile and too few frames to measure; a usual sensor is assumed")
+    return noise.assumed(iso, full_scale_dn)
 
 
 def _transfer(

@@ -52,11 +52,21 @@ def write_frame(
     random = np.random.default_rng(seed)
     electrons = random.poisson(np.clip(signal, 0, 4) * ELECTRONS) + 3 * random.standard_normal(signal.shape)
     mosaic = np.clip(np.rint(electrons / ELECTRONS * (WHITE - BLACK) + BLACK), 0, clip).astype(np.uint16)
-    values: dict = dict(
-        exposure=Fraction(label).limit_denominator(10000), iso=100, fnumber=Fraction(1), focal_mm=Fraction(35),
-        make="Maker", model="One", timestamp="2026:01:02 03:04:05", cfa="RGGB", black=(BLACK,) * 4, white=WHITE,
-        color_matrix=MATRIX, neutral=NEUTRAL, noise=(1 / ELECTRONS, (3 / ELECTRONS) ** 2),
-    )  # fmt: skip
+    values: dict = {
+        "exposure": Fraction(label).limit_denominator(10000),
+        "iso": 100,
+        "fnumber": Fraction(1),
+        "focal_mm": Fraction(35),
+        "make": "Maker",
+        "model": "One",
+        "timestamp": "2026:01:02 03:04:05",
+        "cfa": "RGGB",
+        "black": (BLACK,) * 4,
+        "white": WHITE,
+        "color_matrix": MATRIX,
+        "neutral": NEUTRAL,
+        "noise": (1 / ELECTRONS, (3 / ELECTRONS) ** 2),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(dng_bytes(mosaic, DngFacts(**{**values, **changes})))
 
@@ -135,13 +145,13 @@ def test_listing_order_and_names_change_no_byte(capture):
 
 def test_exposure_times_two_halves_the_radiance(capture):
     """Stating twice the times for the same files halves every value."""
-    _, first, before = run(capture)
+    _, _, before = run(capture)
     text = MANIFEST
     for view, frames in (("plate", PLATE), ("ball", BALL)):
         for number, (label, _) in enumerate(frames):
             text += f'[[exposure]]\nfiles = ["{view}/{9 - number}.dng"]\nexposure_s = {2 * label!r}\n'
     (capture / "capture.toml").write_text(text)
-    _, second, after = run(capture)
+    _, _, after = run(capture)
     for view in ("plate", "ball"):
         a, b = before.outputs["photographs"][view].rgb(), after.outputs["photographs"][view].rgb()
         np.testing.assert_allclose(a, 2 * b, rtol=1e-5, atol=1e-6 * a.max())  # times pass through decimals and logs
@@ -151,9 +161,12 @@ def test_results_survive_the_disk(capture, tmp_path):
     index, merged, developed = run(capture)
     out = tmp_path / "build"
     for artifact, value in (
-        (FACTS, index.outputs["facts"]), (BRACKETS, index.outputs["brackets"]), (MOSAICS, merged.outputs["mosaics"]),
-        (EXPOSURES, merged.outputs["exposures"]), (PHOTOGRAPHS, developed.outputs["photographs"]),
-    ):  # fmt: skip
+        (FACTS, index.outputs["facts"]),
+        (BRACKETS, index.outputs["brackets"]),
+        (MOSAICS, merged.outputs["mosaics"]),
+        (EXPOSURES, merged.outputs["exposures"]),
+        (PHOTOGRAPHS, developed.outputs["photographs"]),
+    ):
         formats.write(out, artifact, value)
     again = develop.compute(formats.read(out, MOSAICS), knobs.Develop(demosaic="bilinear"))
     for view, photograph in formats.read(out, PHOTOGRAPHS).items():
@@ -180,7 +193,7 @@ def test_single_frames_work(capture):
     for view in ("plate", "ball"):
         rgb = developed.outputs["photographs"][view].rgb()
         assert np.all(np.isfinite(rgb))
-        assert merged.numbers[view]["frames"] == 1
+        assert merged.numbers["views"][view]["frames"] == 1
 
 
 def test_all_clipped_view_is_flagged(capture):
@@ -218,6 +231,36 @@ def test_lower_clip_level_than_white_is_found(capture):
     usable = (photograph["mask"] == 0) & (truth[..., 1] > 1)
     relative = photograph.rgb()[usable] / truth[usable]
     assert np.percentile(np.abs(relative / np.median(relative) - 1), 99) < 0.05
+
+
+def test_noise_without_profile_is_measured_scaled_or_assumed(capture):
+    """DNG without NoiseProfile (its tag renamed): ISO 100 from frame pairs, ISO 400 from ISO 100, alone: assumed."""
+
+    def strip(file: Path) -> None:
+        entry = np.array([51041], "<u2").tobytes() + np.array([12], "<u2").tobytes()  # tag, type double
+        data = file.read_bytes()
+        assert data.count(entry) == 1
+        file.write_bytes(data.replace(entry, np.array([65000], "<u2").tobytes() + entry[2:]))
+
+    for number, (label, actual) in enumerate(PLATE):
+        write_frame(capture / f"plate/{9 - number}.dng", scene(192, 256), label, actual, seed=number)
+    for file in (capture / "ball").iterdir():
+        file.unlink()
+    write_frame(capture / "ball/0.dng", scene(192, 256), 0.1, 0.4, 9, iso=400)
+    for file in [*(capture / "plate").iterdir(), *(capture / "ball").iterdir()]:
+        strip(file)
+    _, merged, _ = run(capture)
+    noise = merged.numbers["noise"]
+    assert noise["iso_100"]["source"] == "photon transfer"
+    assert noise["iso_100"]["electrons_at_white"] == pytest.approx(ELECTRONS, rel=0.15)  # a few bins of 300 samples
+    assert noise["iso_400"]["source"] == "scaled from ISO 100"
+    assert noise["iso_400"]["electrons_at_white"] == pytest.approx(noise["iso_100"]["electrons_at_white"] / 4)
+    for file in sorted((capture / "plate").iterdir())[1:]:
+        file.unlink()
+    _, alone, developed = run(capture)
+    assert alone.numbers["noise"]["iso_100"]["source"] == "assumed"
+    assert any("a usual sensor is assumed" in text for text in alone.warnings)
+    assert np.all(np.isfinite(developed.outputs["photographs"]["plate"].rgb()))
 
 
 # ingest
@@ -270,7 +313,8 @@ def test_mixed_sizes_are_refused(capture):
 def test_wishes_name_their_files(capture):
     (capture / "b.obj").write_text("v 0 0 0\n")
     (capture / "scene.toml").write_text(
-        'quality = "draft"\n[merge]\nweights = "poisson"\n[[object]]\nname = "b"\nfile = "b.obj"\nposition_m = [0.1, 0]\n'
+        'quality = "draft"\n[merge]\nweights = "poisson"\n'
+        '[[object]]\nname = "b"\nfile = "b.obj"\nposition_m = [0.1, 0]\n'
     )
     index = ingest.compute(capture, None, knobs.Ingest())
     wish = index.outputs["wishes"]["object"][0]
@@ -287,12 +331,21 @@ def test_different_white_balance_is_reported(capture):
 
 
 def test_missing_colour_matrix_is_refused():
-    raster = Raster({k: np.ones((8, 8), np.float32) for k in ("Y", "variance")} | {"mask": np.zeros((8, 8), np.uint32)},
-                    "camera_rgb")  # fmt: skip
-    profile = dict(file="a.nef", camera="", color_matrix=None, color_matrix_2=None, illuminant=0, illuminant_2=0,
-                   as_shot_neutral=None)  # fmt: skip
+    raster = Raster(
+        {k: np.ones((8, 8), np.float32) for k in ("Y", "variance")} | {"mask": np.zeros((8, 8), np.uint32)},
+        "camera_rgb",
+    )
+    profile = {
+        "file": "a.nef",
+        "camera": "",
+        "color_matrix": None,
+        "color_matrix_2": None,
+        "illuminant": 0,
+        "illuminant_2": 0,
+        "as_shot_neutral": None,
+    }
     raster.attributes.update({"insitu:cfa": "RGGB", "insitu:colour": json.dumps(profile)})
-    with pytest.raises(CaptureError, match="a.nef.*ColorMatrix1"):
+    with pytest.raises(CaptureError, match=r"a\.nef.*ColorMatrix1"):
         develop.compute({"plate": raster}, knobs.Develop())
 
 
@@ -351,8 +404,15 @@ def test_clipped_photosites_poison_nothing_beyond_the_kernel():
     mosaic = np.ones((20, 20), np.float32)
     variance, mask = np.full((20, 20), 0.01, np.float32), np.zeros((20, 20), np.uint32)
     variance[10, 10], mask[10, 10] = np.inf, CLIPPED
-    profile = dict(file="a", camera="", color_matrix=MATRIX.tolist(), color_matrix_2=None, illuminant=21,
-                   illuminant_2=0, as_shot_neutral=NEUTRAL.tolist())  # fmt: skip
+    profile = {
+        "file": "a",
+        "camera": "",
+        "color_matrix": MATRIX.tolist(),
+        "color_matrix_2": None,
+        "illuminant": 21,
+        "illuminant_2": 0,
+        "as_shot_neutral": NEUTRAL.tolist(),
+    }
     header = {"insitu:cfa": "RGGB", "insitu:colour": json.dumps(profile)}
     raster = Raster({"Y": mosaic, "variance": variance, "mask": mask}, "camera_rgb", header)
     for method in ("bilinear", "malvar"):

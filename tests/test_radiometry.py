@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -12,9 +14,7 @@ from pipeline.image.radiometry import Exposed, merge
 
 WHITE, BLACK, ELECTRONS, READ = 15800.0, 512.0, 30000.0, 3.0
 STEP = 1 / (WHITE - BLACK)
-MODEL = Noise(
-    np.full((2, 2), 1 / ELECTRONS), np.full((2, 2), (READ / ELECTRONS) ** 2 + STEP**2 / 12), "given"
-)  # fmt: skip
+MODEL = Noise(np.full((2, 2), 1 / ELECTRONS), np.full((2, 2), (READ / ELECTRONS) ** 2 + STEP**2 / 12), "given")
 LIMIT = radiometry.linear_limits(np.full((2, 2), WHITE), np.full((2, 2), BLACK), WHITE, MODEL)
 STOPS = [4.0**-k for k in (4, 3, 2, 1, 0)]  # five frames, two stops apart, shortest first
 
@@ -77,7 +77,7 @@ def test_close_to_the_cramer_rao_bound():
     """RMSE over the bound of samples below the clip level, in bins of 1/3 decade."""
     edges = np.geomspace(5, 7.0e6, 19) / ELECTRONS
     ratios = []
-    for seed, (low, high) in enumerate(zip(edges[:-1], edges[1:])):
+    for seed, (low, high) in enumerate(itertools.pairwise(edges)):
         radiance = np.tile(np.geomspace(low, high, 200), (200, 1))
         merged = merge(bracket(radiance, seed=1000 + seed), "optimal", workers=2)
         information = np.zeros_like(radiance)

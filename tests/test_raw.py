@@ -18,11 +18,21 @@ MATRIX = np.array([[0.742, -0.205, -0.062], [-0.456, 1.248, 0.233], [-0.106, 0.2
 
 
 def facts(**changes: object) -> DngFacts:
-    values: dict = dict(
-        exposure=Fraction(1, 60), iso=200, fnumber=Fraction(56, 10), focal_mm=Fraction(35), make="Maker", model="One",
-        timestamp="2026:01:02 03:04:05", cfa="RGGB", black=(512, 513, 514, 515), white=15800, color_matrix=MATRIX,
-        neutral=np.array([0.5, 1.0, 0.75]), noise=(2.5e-5, 6e-9),
-    )  # fmt: skip
+    values: dict = {
+        "exposure": Fraction(1, 60),
+        "iso": 200,
+        "fnumber": Fraction(56, 10),
+        "focal_mm": Fraction(35),
+        "make": "Maker",
+        "model": "One",
+        "timestamp": "2026:01:02 03:04:05",
+        "cfa": "RGGB",
+        "black": (512, 513, 514, 515),
+        "white": 15800,
+        "color_matrix": MATRIX,
+        "neutral": np.array([0.5, 1.0, 0.75]),
+        "noise": (2.5e-5, 6e-9),
+    }
     return DngFacts(**{**values, **changes})
 
 

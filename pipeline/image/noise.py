@@ -46,13 +46,14 @@ class Bin:
 
 
 def from_profile(frame: Frame) -> Noise | None:
-    """The DNG NoiseProfile of a frame; None without one (or with one that is not positive)."""
+    """The DNG NoiseProfile of a frame, its floor at least quantisation; None without one, or with one not positive."""
     profile = frame.noise_profile
     if profile is None or not np.all(np.isfinite(profile)) or profile[0] <= 0 or np.any(profile < 0):
         return None
     pairs = profile.reshape(-1, 2)
     planes = np.array([0 if len(pairs) == 1 else "RGB".index(colour) for colour in frame.cfa]).reshape(2, 2)
-    return Noise(pairs[planes, 0], pairs[planes, 1], "NoiseProfile")
+    quantisation = 1 / (12 * (frame.white - float(np.mean(frame.black))) ** 2)
+    return Noise(pairs[planes, 0], np.maximum(pairs[planes, 1], quantisation), "NoiseProfile")
 
 
 def assumed(iso: float, white_minus_black: float) -> Noise:
