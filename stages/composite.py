@@ -29,16 +29,12 @@ GUARDS = {
 
 def compose(plate: Raster, layers: Raster, kind: str) -> tuple[np.ndarray, d.Layers]:
     """The composite (H, W, 3) float32 and its layers, guards complete."""
-    change = d.Change(
-        layers.rgb("obj"), layers["obj.A"], layers.rgb("difference"), layers.rgb("expected"), layers["ground"]
-    )
+    names = ("obj", "lost", "gained", "without")
+    parts = {name: layers.rgb(name) for name in names}
+    change = d.Change(**parts, alpha=layers["obj.A"], ground=layers["ground"])
     rgb = plate.rgb()
-    forms = {
-        "additive": lambda: d.additive(change),
-        "ratio": lambda: d.ratio(change),
-        "auto": lambda: d.chosen(change, rgb),
-    }
-    result = forms[kind]()
+    simple = {"additive": d.additive, "ratio": d.ratio}
+    result = simple[kind](change) if kind in simple else d.chosen(change, rgb)
     picture = result.apply(rgb)
     changed = (result.mul != 1).any(-1) | (result.add != 0).any(-1)
     guards = result.guards | (d.NEGATIVE * ((picture < 0) & (rgb >= 0)).any(-1)).astype(np.uint32)

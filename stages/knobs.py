@@ -71,6 +71,7 @@ class Reflectance(Params):
 class Render(Params):
     """With and without the objects."""
 
+    strategy: Literal["difference", "reference"] = Field("difference", description="the change itself, or two renders")
     samples: int = Field(64, ge=1, le=65536, description="samples per pixel")
     depth: int = Field(6, ge=2, le=64, description="longest path [vertices]")
     threshold: float = Field(0.002, ge=0, le=0.05, description="change below this fraction is left to the plate")

@@ -1,9 +1,8 @@
-"""With and without the objects: LS_obj, LS_noobj and their difference, where the objects change anything.
+"""What the objects are and what they change: object layer, lost and gained light, where it matters.
 
-A pilot at one eighth of the size says which blocks change by more than ``threshold`` of LS_noobj; only those are traced,
-with the same random numbers in both worlds (the reference strategy: two full path-traced images). Pixels that objects
-cover get more samples. Limits: one plane as local scene, distant light, no caustics through glass beyond plain path
-tracing.
+A pilot at one eighth of the size says which blocks change by more than ``threshold`` of LS_noobj; only those are traced.
+``strategy = "difference"`` estimates the change itself; ``"reference"`` traces two full images with the same random
+numbers. Pixels that objects cover get more samples. Limits: one plane as local scene, distant light.
 """
 
 from __future__ import annotations
@@ -19,16 +18,18 @@ from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
+from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.scene import build_worlds, material_bsdf, mesh_shape
-from pipeline.transport.trace import Rays, Samples, trace
+from pipeline.transport.trace import Rays, Samples, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Raster, Result, View
 from stages import knobs
 
 BLOCK = 8  # px, side of a pilot cell
-PILOT_SAMPLES = 256
+PILOT_SAMPLES = 64
 FEATHER = 2 * BLOCK  # px over which the change fades out at the border of the region
+STRATEGIES = {"difference": difference_block, "reference": reference_block}
 OBJECT_BOOST = 4  # more samples where an object is seen
 
 
@@ -73,14 +74,16 @@ def influence(
     rows = np.minimum(np.arange(BLOCK // 2, height + BLOCK // 2, BLOCK), height - 1)
     columns = np.minimum(np.arange(BLOCK // 2, width + BLOCK // 2, BLOCK), width - 1)
     index = (rows[:, None] * width + columns).ravel()
-    pilot = trace(worlds, camera_rays[index], PILOT_SAMPLES, min(params.depth, 4), params.seed + 1, BLOCK)
+    pilot = trace(
+        difference_block, worlds, camera_rays[index], PILOT_SAMPLES, min(params.depth, 4), params.seed + 1, BLOCK
+    )
     grid = (len(rows), len(columns))
     expected = pilot.albedo * light / np.pi
 
     def smooth(values: np.ndarray) -> np.ndarray:
         return gaussian_filter(values.reshape(*grid, 3), (1, 1, 0), mode="nearest")
 
-    change = np.linalg.norm(smooth(pilot.difference), axis=-1)
+    change = np.linalg.norm(smooth(pilot.lost + pilot.gained), axis=-1)
     level = np.linalg.norm(smooth(expected), axis=-1)
     blocks = (change > params.threshold * level) & (level > 0) | (pilot.alpha.reshape(grid) > 0)
     blocks = binary_dilation(blocks, np.ones((5, 5)))
@@ -93,21 +96,13 @@ def influence(
 
 def trace_region(worlds: Any, rays: Rays, params: knobs.Render) -> Samples:
     """The pixels of the region, then those that show an object again with more samples, merged by sample count."""
-    first = trace(worlds, rays, params.samples, params.depth, params.seed + 2)
+    strategy = STRATEGIES[params.strategy]
+    first = trace(strategy, worlds, rays, params.samples, params.depth, params.seed + 2)
     shown = np.flatnonzero(first.alpha > 0)
     if not len(shown):
         return first
-    again = trace(worlds, rays[shown], params.samples * OBJECT_BOOST, params.depth, params.seed + 3)
-    share = OBJECT_BOOST / (1 + OBJECT_BOOST)
-    merged = {}
-    for name, values in vars(first).items():
-        if name == "not_finite":
-            continue
-        weights = (1 - share, share) if "variance" not in name else ((1 - share) ** 2, share**2)
-        values = values.copy()
-        values[shown] = weights[0] * values[shown] + weights[1] * getattr(again, name)
-        merged[name] = values
-    return Samples(**merged, not_finite=first.not_finite + again.not_finite)
+    again = trace(strategy, worlds, rays[shown], params.samples * OBJECT_BOOST, params.depth, params.seed + 3)
+    return first.merged(shown, again, OBJECT_BOOST / (1 + OBJECT_BOOST))
 
 
 def compute(
@@ -140,7 +135,7 @@ def compute(
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     samples = trace_region(worlds, rays[pixels], params)
     layers = to_layers(samples, pixels, weight, shape, light)
-    numbers = measure(samples, weight, layers, light)
+    numbers = measure(samples, weight, layers, light, params)
     numbers["variant"] = mi.variant()
     if samples.not_finite:
         warnings.append(f"render: {samples.not_finite} samples were not finite and count as zero")
@@ -151,7 +146,7 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
     """Layers that change nothing."""
     names = [
         f"{layer}.{c}"
-        for layer in ("obj", "with", "without", "difference", "expected", "variance", "objvariance")
+        for layer in ("obj", "with", "without", "lost", "gained", "variance", "objvariance")
         for c in "RGB"
     ]
     return Raster({name: np.zeros(shape, np.float32) for name in [*names, "obj.A", "ground", "influence"]}, ACESCG)
@@ -168,23 +163,25 @@ def to_layers(
         return image.reshape(*shape, *values.shape[1:])
 
     fade = weight.ravel()[pixels, None]
-    expected = samples.albedo * light / np.pi
-    channels = {
-        **Raster.split(place(samples.obj), "obj"),
-        "obj.A": place(samples.alpha),
-        **Raster.split(place(samples.ground_with), "with"),
-        **Raster.split(place(samples.ground_without), "without"),
-        **Raster.split(place(samples.difference * fade), "difference"),
-        **Raster.split(place(expected), "expected"),
-        **Raster.split(place(samples.difference_variance * fade**2), "variance"),
-        **Raster.split(place(samples.obj_variance), "objvariance"),
-        "ground": place(samples.ground),
-        "influence": weight.astype(np.float32),
+    without = samples.albedo * light / np.pi  # equation 7: in closed form, so without noise
+    lost, gained = samples.lost * fade, samples.gained * fade
+    layers = {
+        "obj": samples.obj,
+        "with": without + lost + gained,
+        "without": without,
+        "lost": lost,
+        "gained": gained,
+        "variance": samples.change_variance * fade**2,
+        "objvariance": samples.obj_variance,
     }
+    channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(place(rgb), layer).items()}
+    channels |= {"obj.A": place(samples.alpha), "ground": place(samples.ground), "influence": weight}
     return Raster(channels, ACESCG)
 
 
-def measure(samples: Samples, weight: np.ndarray, layers: Raster, light: np.ndarray) -> dict[str, Any]:
+def measure(
+    samples: Samples, weight: np.ndarray, layers: Raster, light: np.ndarray, params: knobs.Render
+) -> dict[str, Any]:
     """What was traced, how noisy it is, and how well the closed form of LS_noobj agrees with the render."""
     model = samples.albedo * light / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
@@ -195,10 +192,11 @@ def measure(samples: Samples, weight: np.ndarray, layers: Raster, light: np.ndar
         "not_finite_samples": samples.not_finite,
     }
     if bare.any():
-        level, noise = np.linalg.norm(model[bare], axis=1), np.sqrt(samples.difference_variance[bare].sum(1))
+        level, noise = np.linalg.norm(model[bare], axis=1), np.sqrt(samples.change_variance[bare].sum(1))
         numbers["change_noise_rel"] = float(np.median(noise / level))
-        numbers["deepest_shadow"] = float(np.quantile(samples.difference[bare].sum(1) / model[bare].sum(1), 0.001))
-        numbers["noobj_over_closed_form"] = float(samples.ground_without[bare].sum() / model[bare].sum())
+        numbers["deepest_shadow"] = float(np.quantile((samples.lost + samples.gained)[bare].sum(1) / model[bare].sum(1), 0.001))
+        if params.strategy == "reference":
+            numbers["noobj_over_closed_form"] = float(samples.without[bare].sum() / model[bare].sum())
     if covered.any():
         level, noise = np.linalg.norm(samples.obj[covered], axis=1), np.sqrt(samples.obj_variance[covered].sum(1))
         numbers["object_noise_rel"] = float(np.median(noise / level))

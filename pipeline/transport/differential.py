@@ -4,10 +4,10 @@
     (4)  LS_final = LS_obj - Error = LS_b + (LS_obj - LS_noobj)      additive; may turn negative
     (5)  LS_final = LS_b * LS_obj / LS_noobj                         ratio; undefined as LS_noobj -> 0
 
-Every form is returned as the layers ``plate * mul + add + obj``. With D = LS_obj - LS_noobj estimated from
-common random numbers and N the *expected* LS_noobj (closed form on a plane), the ratio is 1 + D / N: linear in the noise,
-so unbiased, which a quotient of two noisy renders is not. All arrays are float, (H, W, 3) or (H, W), and carry coverage:
-a pixel half covered by an object has ``alpha`` 0.5 and D, N of its uncovered half.
+Every form is returned as the layers ``plate * mul + add + obj``. With D = LS_obj - LS_noobj
+estimated directly and N the *expected* LS_noobj (closed form on a plane), the ratio is 1 + D / N: linear in the noise, so
+unbiased, which a quotient of two noisy renders is not. All arrays are float, (H, W, 3) or (H, W), and carry coverage: a
+pixel half covered by an object has ``alpha`` 0.5 and D, N of its uncovered half.
 """
 
 from __future__ import annotations
@@ -32,9 +32,15 @@ class Change:
 
     obj: np.ndarray  # (H, W, 3) premultiplied object layer
     alpha: np.ndarray  # (H, W) coverage by objects
-    difference: np.ndarray  # (H, W, 3) LS_obj - LS_noobj of the uncovered part
-    expected: np.ndarray  # (H, W, 3) expected LS_noobj of the uncovered part
+    lost: np.ndarray  # (H, W, 3) light that the objects take from the uncovered part, <= 0
+    gained: np.ndarray  # (H, W, 3) light that they add to it
+    without: np.ndarray  # (H, W, 3) expected LS_noobj of the uncovered part
     ground: np.ndarray  # (H, W) share of the pixel that shows the modelled local scene
+
+    @property
+    def difference(self) -> np.ndarray:
+        """LS_obj - LS_noobj of the uncovered part (H, W, 3)."""
+        return self.lost + self.gained
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +66,7 @@ def additive(change: Change) -> Layers:
 
 def ratio(change: Change) -> Layers:
     """Equation 5, additive where LS_noobj is too small for it (flag NO_MODEL)."""
-    relative, usable = relative_change(change)
+    relative, usable = relative_to_model(change, change.difference)
     mul = (1 - change.alpha)[..., None] + np.where(usable, relative, 0.0)
     guards = NO_MODEL * (~usable & (change.difference != 0)).any(-1)
     guards = guards + BOUNDED * (mul < 0).any(-1)
@@ -70,35 +76,33 @@ def ratio(change: Change) -> Layers:
 def chosen(change: Change, plate: np.ndarray) -> Layers:
     """The default: lost light as a ratio, gained light additively with a bounded gain of plate over model.
 
-    A shadow is a share of the light that was there, so its ratio is right whatever the albedo; added light is right up
-    to the albedo's error, which the plate tells, and bounding that gain keeps it finite where the model fails.
+    ``LS_b * V + I * bounded gain``: a shadow is a share of the light that was there, so its ratio is right whatever the
+    albedo; added light is right up to the albedo's error, which the plate tells, and bounding that gain keeps it finite
+    where the model fails.
     """
-    relative, usable = relative_change(change)
-    lost = (change.difference < 0) & usable
-    model = np.divide(
-        change.expected, change.ground[..., None], out=np.zeros_like(plate, float), where=change.ground[..., None] > 0
-    )
-    gain = np.divide(plate, model, out=np.ones_like(model), where=usable & (model > 0))
+    relative, usable = relative_to_model(change, change.lost)
+    share = change.ground[..., None]
+    model = np.divide(change.without, share, out=np.zeros(plate.shape), where=share > 0)
+    gain = np.divide(plate, model, out=np.ones(plate.shape), where=usable & (model > 0))
     bounded = np.clip(gain, *GAIN_RANGE)
-    mul = (1 - change.alpha)[..., None] + np.where(lost, relative, 0.0)
-    add = np.where(lost, 0.0, change.difference * bounded)
-    changed = change.difference != 0
-    guards = NO_MODEL * (~usable & changed).any(-1)
-    guards = guards + GAIN_LIMITED * ((bounded != gain) & changed & ~lost).any(-1)
+    mul = (1 - change.alpha)[..., None] + np.where(usable, relative, 0.0)
+    add = change.gained * bounded + np.where(usable, 0.0, change.lost)
+    guards = NO_MODEL * (~usable & (change.difference != 0)).any(-1)
+    guards = guards + GAIN_LIMITED * ((bounded != gain) & (change.gained != 0)).any(-1)
     guards = guards + BOUNDED * (mul < 0).any(-1)
     return _layers(np.maximum(mul, 0), add, change, guards)
 
 
-def relative_change(change: Change) -> tuple[np.ndarray, np.ndarray]:
-    """D / N (H, W, 3) times the uncovered share, and where N is large enough to form it."""
+def relative_to_model(change: Change, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``part`` / LS_noobj (H, W, 3) times the uncovered share, and where LS_noobj is large enough to form it."""
     share = change.ground[..., None]
-    lit = change.expected[change.ground > 0.5]
+    lit = change.without[change.ground > 0.5]
     floor = FAINT_MODEL * float(np.median(lit)) if lit.size else 0.0
-    usable = (change.expected > floor * share) & (share > 0)
-    relative = np.divide(change.difference, change.expected, out=np.zeros_like(change.difference), where=usable)
+    usable = (change.without > floor * share) & (share > 0)
+    relative = np.divide(part, change.without, out=np.zeros(part.shape), where=usable)
     return relative * share, usable
 
 
 def _layers(mul: np.ndarray, add: np.ndarray, change: Change, guards: np.ndarray) -> Layers:
-    arrays = (np.asarray(values, np.float32) for values in (mul, add, change.obj))
-    return Layers(*arrays, guards=np.asarray(guards, np.uint32))
+    mul, add, obj = (np.asarray(values, np.float32) for values in (mul, add, change.obj))
+    return Layers(mul, add, obj, np.asarray(guards, np.uint32))

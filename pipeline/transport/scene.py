@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pipeline.conventions import latlong_directions
 from pipeline.image.colour import convert
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.variant import use_mitsuba
@@ -28,6 +29,9 @@ class Worlds:
     ground_with: Any
     ground_without: Any
     ground_albedo: Any  # texture, for the albedo at a hit
+    above: Any  # scene that holds only the light from above the plane, for sampling and evaluating it
+    plane: Plane
+    bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
 
 
 def envmap_grid(rgb: np.ndarray) -> np.ndarray:
@@ -114,6 +118,20 @@ def ground_texture(mi: Any, albedo: np.ndarray) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
 
 
+def above_plane(rgb: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """A map (H, W, 3) with nothing in texels that lie wholly below the plane: their light never reaches it."""
+    height, width = rgb.shape[:2]
+    reach = np.hypot(np.pi / height, 2 * np.pi / width)
+    return np.where((latlong_directions(height, width) @ normal > -reach)[..., None], rgb, 0.0)
+
+
+def bounding_sphere(shape: Any) -> np.ndarray:
+    """(4,) centre and radius of the sphere around a shape's bounding box."""
+    box = shape.bbox()
+    low, high = np.array(box.min).ravel(), np.array(box.max).ravel()
+    return np.array([*(low + high) / 2, np.linalg.norm(high - low) / 2])
+
+
 def build_worlds(plane: Plane, albedo: np.ndarray, environment: np.ndarray, objects: dict[str, Any]) -> Worlds:
     """Scenes with and without objects.
 
@@ -121,7 +139,7 @@ def build_worlds(plane: Plane, albedo: np.ndarray, environment: np.ndarray, obje
         plane: the local scene.
         albedo: (H, W, 3) texture over the plane's corners (first row at corner 0 to 1), or (3,).
         environment: (H, W, 3) lat-long radiance, the distant scene.
-        objects: name -> Mitsuba shape or description, world frame.
+        objects: name -> Mitsuba shape, world frame.
     """
     mi = use_mitsuba()
     texture = ground_texture(mi, albedo)
@@ -132,4 +150,15 @@ def build_worlds(plane: Plane, albedo: np.ndarray, environment: np.ndarray, obje
         ground = mi.load_dict(ground_shape(plane, ground_bsdf))
         scenes.append((mi.load_dict({**shared, "ground": ground, **synthetic}), ground))
     (with_objects, ground_with), (without, ground_without) = scenes
-    return Worlds(mi, with_objects, without, ground_with, ground_without, mi.load_dict(texture))
+    above = environment_emitter(mi, above_plane(environment, plane.normal))
+    return Worlds(
+        mi=mi,
+        with_objects=with_objects,
+        without_objects=without,
+        ground_with=ground_with,
+        ground_without=ground_without,
+        ground_albedo=mi.load_dict(texture),
+        above=mi.load_dict({"type": "scene", "distant": above}),
+        plane=plane,
+        bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
+    )

@@ -1,16 +1,16 @@
-"""Path tracing through the photographed lens: what the objects are, and what they change on the local scene.
+"""Rays through the photographed lens, and the reference strategy: two full path-traced images.
 
-Every camera sample is traced in both worlds with the same random numbers. A sample that meets an object goes to the
-object layer (premultiplied); one that meets the local scene contributes to LS_obj, LS_noobj and their difference, so
-coverage, object and difference come from the same samples and edges are exact. Camera rays go through the inverse of
-the lens: neither plate nor layers are ever resampled.
+A camera sample that meets an object goes to the object layer (premultiplied); one that meets the local scene contributes
+to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and edges are
+exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The reference traces
+every sample in both worlds with the same random numbers; `pipeline.transport.difference` is the fast strategy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -51,19 +51,19 @@ class Rays:
 class Samples:
     """Means over the samples of each pixel, and variances of those means. Radiance, ACEScg.
 
-    ``ground*`` are over the samples that meet the local scene, divided by *all* samples of the pixel (so they carry
-    the factor of coverage left to the local scene).
+    What concerns the local scene is over the samples that meet it, divided by *all* samples of the pixel (so it carries
+    the share of the pixel left to the local scene).
     """
 
     obj: np.ndarray  # (N, 3) object layer, premultiplied
     alpha: np.ndarray  # (N,)
-    ground_with: np.ndarray  # (N, 3) LS_obj
-    ground_without: np.ndarray  # (N, 3) LS_noobj
-    difference: np.ndarray  # (N, 3) LS_obj - LS_noobj
+    lost: np.ndarray  # (N, 3) light of LS_noobj that the objects take away, <= 0
+    gained: np.ndarray  # (N, 3) light that the objects add
+    without: np.ndarray  # (N, 3) LS_noobj
     albedo: np.ndarray  # (N, 3) albedo of the local scene where it is seen
     ground: np.ndarray  # (N,) share of samples that meet the local scene
     obj_variance: np.ndarray  # (N, 3)
-    difference_variance: np.ndarray  # (N, 3)
+    change_variance: np.ndarray  # (N, 3) of lost + gained
     not_finite: int = 0
 
     @classmethod
@@ -77,7 +77,29 @@ class Samples:
         return cls(**arrays, not_finite=sum(part.not_finite for part in parts))
 
 
+    def merged(self, index: np.ndarray, other: Samples, share: float) -> Samples:
+        """Pixels ``index`` averaged with ``other``, which has weight ``share``; the rest as they are."""
+        result = {}
+        for field in fields(self):
+            values = getattr(self, field.name)
+            if field.name == "not_finite":
+                continue
+            own, theirs = ((1 - share) ** 2, share**2) if "variance" in field.name else (1 - share, share)
+            result[field.name] = values.copy()
+            result[field.name][index] = own * values[index] + theirs * getattr(other, field.name)
+        return Samples(**result, not_finite=self.not_finite + other.not_finite)
+
+
+class Strategy(Protocol):
+    """Traces one block of pixels; see `reference_block` and `pipeline.transport.difference.difference_block`."""
+
+    def __call__(
+        self, worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float
+    ) -> Samples: ...
+
+
 def trace(
+    strategy: Strategy,
     worlds: Worlds,
     rays: Rays,
     samples: int,
@@ -86,7 +108,7 @@ def trace(
     footprint_px: float = 1.0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Samples:
-    """Trace ``samples`` paths of at most ``depth`` vertices per pixel in both worlds.
+    """Trace ``samples`` camera samples per pixel with paths of at most ``depth`` vertices.
 
     ``footprint_px`` is the side of the square over which camera rays are spread (1 = the pixel, box filter). The same
     seed gives the same bytes. Samples that are not finite count as zero and are counted.
@@ -95,74 +117,86 @@ def trace(
     parts = []
     for start in range(0, len(rays), pixels):
         block = rays[start : start + pixels]
-        parts.append(_trace_block(worlds, block, samples, depth, seed + 7919 * (start // pixels), footprint_px))
+        parts.append(strategy(worlds, block, samples, depth, seed + 7919 * (start // pixels), footprint_px))
         progress(min(1.0, (start + pixels) / len(rays)))
     return Samples.joined(parts)
 
 
-def _camera_rays(mi: Any, dr: Any, rays: Rays, samples: int, jitter: Any, footprint_px: float) -> Any:
+def camera_rays(mi: Any, dr: Any, rays: Rays, samples: int, jitter: Any, footprint_px: float) -> Any:
+    """A ray per sample; ``jitter`` in [0, 1)^2 places it in the footprint."""
     pixel = dr.arange(mi.UInt32, len(rays) * samples) // samples
     offset = (jitter - 0.5) * footprint_px
 
     def fetch(rows: np.ndarray) -> Any:
-        return mi.Vector3f(
-            *[dr.gather(mi.Float, mi.Float(np.ascontiguousarray(rows[:, i], np.float32)), pixel) for i in range(3)]
-        )
+        columns = [mi.Float(np.ascontiguousarray(rows[:, i], np.float32)) for i in range(3)]
+        return mi.Vector3f(*[dr.gather(mi.Float, column, pixel) for column in columns])
 
     direction = fetch(rays.centre) + fetch(rays.by_x) * offset.x + fetch(rays.by_y) * offset.y
     return mi.RayDifferential3f(mi.Point3f(*[float(v) for v in rays.origin]), dr.normalize(direction))
 
 
-def _trace_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
+def make_sampler(mi: Any, samples: int) -> Any:
+    """Low-discrepancy points where there are enough samples for a grid of strata."""
+    return mi.load_dict({"type": "multijitter" if samples >= 4 else "independent", "sample_count": samples})
+
+
+def reference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
+    """The reference strategy: LS_obj and LS_noobj path traced in full, with the same random numbers."""
     import drjit as dr
 
     mi = worlds.mi
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER, "hide_emitters": True})
-    # Low-discrepancy points need a rectangular grid of at least 2 x 2 strata.
-    sampler = mi.load_dict({"type": "multijitter" if samples >= 4 else "independent", "sample_count": samples})
+    sampler = make_sampler(mi, samples)
     count = sampler.sample_count()
 
-    def radiance(scene: Any) -> tuple[Any, Any, Any]:
+    def radiance(scene: Any) -> tuple[Any, Any]:
         sampler.set_samples_per_wavefront(count)
         sampler.seed(seed, len(rays) * count)
-        ray = _camera_rays(mi, dr, rays, count, sampler.next_2d(), footprint_px)
-        color, valid, _ = integrator.sample(scene, sampler, ray)
-        return ray, color, valid
+        ray = camera_rays(mi, dr, rays, count, sampler.next_2d(), footprint_px)
+        return ray, integrator.sample(scene, sampler, ray)[0]
 
-    ray, with_objects, _ = radiance(worlds.with_objects)
-    _, without_objects, _ = radiance(worlds.without_objects)
+    ray, with_objects = radiance(worlds.with_objects)
+    _, without_objects = radiance(worlds.without_objects)
     hit = worlds.with_objects.ray_intersect(ray)
     on_ground = hit.is_valid() & (hit.shape == mi.ShapePtr(worlds.ground_with))
     on_object = hit.is_valid() & ~on_ground
     finite = dr.all(dr.isfinite(with_objects)) & dr.all(dr.isfinite(without_objects))
-    zero = mi.Color3f(0.0)
-    obj = dr.select(on_object & finite, with_objects, zero)
     kept = on_ground & finite
-    ground_with = dr.select(kept, with_objects, zero)
-    ground_without = dr.select(kept, without_objects, zero)
-    difference = ground_with - ground_without
-    albedo = dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), zero)
-    one = [dr.select(on_object, 1.0, 0.0), dr.select(on_ground, 1.0, 0.0), dr.select(finite, 0.0, 1.0)]
-    planes = [*obj, *ground_with, *ground_without, *difference, *albedo, *dr.square(obj), *dr.square(difference), *one]
+    difference = dr.select(kept, with_objects - without_objects, mi.Color3f(0.0))
+    return collect(
+        mi,
+        count,
+        obj=dr.select(on_object & finite, with_objects, mi.Color3f(0.0)),
+        lost=dr.minimum(difference, 0.0),
+        gained=dr.maximum(difference, 0.0),
+        without=dr.select(kept, without_objects, mi.Color3f(0.0)),
+        albedo=dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), mi.Color3f(0.0)),
+        masks=(on_object, on_ground, finite),
+    )
+
+
+def collect(
+    mi: Any, count: int, obj: Any, lost: Any, gained: Any, without: Any, albedo: Any, masks: tuple[Any, Any, Any]
+) -> Samples:
+    """Sum the samples of each pixel. ``masks``: meets an object, meets the local scene, is finite."""
+    import drjit as dr
+
+    ones = [dr.select(mask, mi.Float(1.0), mi.Float(0.0)) for mask in (masks[0], masks[1], ~masks[2])]
+    change = lost + gained
+    planes = [*obj, *lost, *gained, *without, *albedo, *dr.square(obj), *dr.square(change), *ones]
     planes = [mi.Float(plane) for plane in planes]
     dr.eval(planes)  # once, else each sum below would run the whole kernel again
     means = np.stack([np.asarray(dr.block_sum(plane, count)) for plane in planes]).astype(np.float64) / count
-    return _collect(means, count)
-
-
-def _collect(means: np.ndarray, count: int) -> Samples:
-    triple = [means[3 * i : 3 * i + 3].T for i in range(7)]
-    obj, ground_with, ground_without, difference, albedo, obj_square, difference_square = triple
+    names = ("obj", "lost", "gained", "without", "albedo", "obj_square", "change_square")
+    triple = {name: means[3 * i : 3 * i + 3].T for i, name in enumerate(names)}
     spread = 1.0 / max(count - 1, 1)
+    obj_square, change_square = triple.pop("obj_square"), triple.pop("change_square")
+    mean_change = triple["lost"] + triple["gained"]
     return Samples(
-        obj=obj,
+        **triple,
         alpha=means[21],
-        ground_with=ground_with,
-        ground_without=ground_without,
-        difference=difference,
-        albedo=albedo,
         ground=means[22],
-        obj_variance=np.maximum(obj_square - obj**2, 0) * spread,
-        difference_variance=np.maximum(difference_square - difference**2, 0) * spread,
+        obj_variance=np.maximum(obj_square - triple["obj"] ** 2, 0) * spread,
+        change_variance=np.maximum(change_square - mean_change**2, 0) * spread,
         not_finite=round(means[23].sum() * count),
     )
