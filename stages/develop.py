@@ -5,8 +5,8 @@ Method: white balance of the mosaic by AsShotNeutral (so that interpolation does
 ColorMatrix tags (DNG 1.7.1 chapter 6, Bradford): the camera's neutral becomes (1, 1, 1) times its green signal. All
 views use one profile, so plate and ball agree. Variances go through the squared kernels and the squared matrix.
 
-Limits: the covariance of the three channels is left out (the matrix mixes them, and so overstates nothing but also
-correlates them); vignetting is not corrected. Values that touched a clipped photosite are lower bounds: they carry
+Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance that kernels and
+matrix give neighbouring pixels and channels; vignetting is not corrected. Values that touched a clipped photosite are lower bounds: they carry
 CLIPPED and an infinite variance. Negative and out-of-gamut values are kept and counted.
 """
 
@@ -37,13 +37,12 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
         developed = list(pool.map(lambda view: develop(mosaics[view], profiles[view], params.demosaic, view), mosaics))
     photographs = dict(zip(mosaics, developed))
     numbers = {view: _numbers(raster) for view, raster in photographs.items()}
-    warnings, evidence = [], [_distortion_of_light()]
-    for profile in profiles.values():
-        if profile["as_shot_neutral"] is None:
-            warnings.append(f"{profile['file']}: no AsShotNeutral; the scene's white is taken as D65")
-        if profile["color_matrix_2"] is None:
-            evidence.append(_one_matrix(profile))
-        break  # merge gives all views one profile
+    warnings, evidence = [], [_vignetting()]
+    profile = next(iter(profiles.values()))  # merge gives all views one
+    if profile["as_shot_neutral"] is None:
+        warnings.append(f"{profile['file']}: no AsShotNeutral; the scene's white is taken as D65")
+    if profile["color_matrix_2"] is None:
+        evidence.append(_one_matrix(profile))
     return Result({"photographs": photographs}, {"views": numbers}, warnings, evidence)
 
 
@@ -100,7 +99,7 @@ def _numbers(photograph: Raster) -> dict[str, Any]:
     }
 
 
-def _distortion_of_light() -> dict[str, Any]:
+def _vignetting() -> dict[str, Any]:
     return {
         "term": "vignetting",
         "modelled": False,
