@@ -5,9 +5,10 @@ Method: white balance of the mosaic by AsShotNeutral (so that interpolation does
 ColorMatrix tags (DNG 1.7.1 chapter 6, Bradford): the camera's neutral becomes (1, 1, 1) times its green signal. All
 views use one profile, so plate and ball agree. Variances go through the squared kernels and the squared matrix.
 
-Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance that kernels and
-matrix give neighbouring pixels and channels; vignetting is not corrected. Values that touched a clipped photosite are lower bounds: they carry
-CLIPPED and an infinite variance. Negative and out-of-gamut values are kept and counted.
+Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance of
+neighbouring pixels and channels that kernels and matrix make; vignetting is not corrected. Values that touched a
+clipped photosite are lower bounds: they carry CLIPPED and an infinite variance. Negative and out-of-gamut values are
+kept and counted.
 """
 
 from __future__ import annotations
