@@ -1,0 +1,231 @@
+"""SCENE.toml of ``insitu simulate``: what is photographed, with which camera, and how well the truth is computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from pipeline.run.errors import ManifestError
+from pipeline.run.manifest import BoardFacts, Rgb, Strict, load_toml, problems_of
+
+Point = tuple[float, float, float]
+Span = tuple[float, float]
+
+
+class CameraModel(Strict):
+    """Lens and body. Pixel origin of conventions."""
+
+    width: int = Field(gt=15, multiple_of=2)
+    height: int = Field(gt=15, multiple_of=2)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0, 0, 0, 0, 0)
+    blur_sigma_px: float = Field(0.55, ge=0.29, le=0.76, description="Gaussian, the pixel's box included")
+    focal_mm: float = Field(gt=0)
+    fnumber: float = Field(gt=0)
+    iso: int = Field(gt=0)
+    make: str = "insitu"
+    model: str = "Simulated"
+
+
+class SensorModel(Strict):
+    """Noise and colour of the sensor."""
+
+    cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] = "RGGB"
+    black: tuple[int, int, int, int] = (512, 512, 512, 512)
+    white: int = Field(15800, gt=0, lt=65536)
+    e_per_dn: float = Field(gt=0)
+    read_noise_e: float = Field(ge=0)
+    prnu: float = Field(0.005, ge=0, lt=0.2)
+    hot_pixels: int = Field(0, ge=0)
+    hot_e_per_s: Span = (2e3, 1e5)
+    color_matrix: tuple[Point, Point, Point] = Field(description="camera_rgb from XYZ under D65; scaled to green = 1")
+
+
+class SoftboxFacts(Strict):
+    """A window or a soft light: a rectangle on the sky, with a cross of bars when bar_deg > 0."""
+
+    azimuth_deg: float
+    elevation_deg: float = Field(ge=-89, le=89)
+    half_deg: Span
+    radiance: Rgb
+    edge_deg: float = Field(1.5, gt=0)
+    bar_deg: float = Field(0.0, ge=0)
+
+
+class LampFacts(Strict):
+    """A round light; the sun is one of 0.53 degrees."""
+
+    azimuth_deg: float
+    elevation_deg: float = Field(ge=-90, le=90)
+    diameter_deg: float = Field(gt=0.1, lt=90)
+    radiance: Rgb
+    edge_deg: float = Field(0.6, gt=0)
+
+
+class LightFacts(Strict):
+    """The distant scene. All radiances are multiplied by ``scale``."""
+
+    scale: float = Field(1.0, gt=0)
+    wall: Rgb
+    wall_variation: float = Field(0.3, ge=0, le=1)
+    wall_azimuth_deg: float = 0.0
+    ceiling: Rgb
+    floor: Rgb
+    softbox: list[SoftboxFacts] = Field([], description="later ones cover earlier ones")
+    lamp: list[LampFacts] = Field([], description="cover the soft boxes")
+    map_width: int = Field(2048, ge=16, le=8192, multiple_of=2)
+
+
+class TableFacts(Strict):
+    """The table top, y = 0: procedural wood, diffuse, or glossy by the glTF material when roughness is given."""
+
+    x_m: Span
+    z_m: Span
+    texel_m: float = Field(0.0005, gt=0)
+    albedo: Rgb = (0.45, 0.33, 0.22)
+    contrast: float = Field(1.0, ge=0, le=2)
+    roughness: float | None = Field(None, gt=0, le=1)
+
+
+class PrintFacts(Strict):
+    """How the board is printed."""
+
+    paper: Rgb = (0.80, 0.80, 0.79)
+    ink: Rgb = (0.04, 0.04, 0.042)
+    px_per_mm: float = Field(7.0, gt=0)
+
+
+class BallModel(Strict):
+    """The mirror ball; it stands on the table."""
+
+    position_m: Span = Field(description="x, z")
+    diameter_m: float = Field(gt=0)
+    reflectance: Rgb
+
+
+class ViewFacts(Strict):
+    """A camera position. A ball view without position is taken from the plate's tripod."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    position_m: Point | None = None
+    target_m: Point | None = None
+
+
+class Lathe(Strict):
+    """A profile of (radius, height) turned about the y axis, through smooth curves."""
+
+    kind: Literal["lathe"]
+    profile_m: list[Span] = Field(min_length=3)
+
+
+class Sphere(Strict):
+    """A sphere that stands on the table."""
+
+    kind: Literal["sphere"]
+    radius_m: float = Field(gt=0)
+
+
+class Torus(Strict):
+    """A ring, lying or standing on its edge."""
+
+    kind: Literal["torus"]
+    major_m: float = Field(gt=0)
+    minor_m: float = Field(gt=0)
+    standing: bool = False
+
+
+class ObjectModel(Strict):
+    """A synthetic object; base_color is linear Rec.709 as in glTF, rounded to 1/255 as the file stores it."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    shape: Annotated[Lathe | Sphere | Torus, Field(discriminator="kind")]
+    base_color: Rgb
+    metallic: float = Field(ge=0, le=1)
+    roughness: float = Field(ge=0, le=1)
+    position_m: Span
+    yaw_deg: float = 0.0
+    segments: int = Field(96, ge=8)
+
+
+class BoardPhoto(Strict):
+    """A calibration photograph: the board's centre is seen at the fraction ``at`` of the picture."""
+
+    tilt_deg: float = Field(ge=0, le=70, description="between the view axis to the centre and the board's normal")
+    azimuth_deg: float = Field(description="where the camera stands; 0 is below the print (+z), 90 at its right")
+    distance_m: float = Field(gt=0)
+    roll_deg: float = 0.0
+    at: Span = (0.5, 0.5)
+
+
+class BracketFacts(Strict):
+    """Exposures: the fullest channel of the plate's middle frame and of the shortest ball frame."""
+
+    plate_ev: list[int] = Field([-2, 0, 2], min_length=1)
+    plate_fill: float = Field(0.85, gt=0, le=1)
+    ball_frames: int = Field(6, ge=1, le=12)
+    ball_step_ev: int = Field(2, ge=1, le=4)
+    ball_fill: float = Field(0.8, gt=0, le=1)
+    started: str = Field("2026:03:14 10:00:00", description="EXIF time of the first frame")
+
+
+class SamplingFacts(Strict):
+    """Samples per pixel; each is a whole number of stratified passes."""
+
+    pass_samples: int = Field(64, ge=1, description="samples per pixel of one pass")
+    plate: int = Field(256, ge=1)
+    region: int = Field(4096, ge=1, description="where the objects change the plate")
+    object: int = Field(16384, ge=1, description="where the objects are seen")
+    region_pass: int = Field(1024, ge=1, description="samples per pixel of one pass in region and object")
+    region_threshold: float = Field(0.01, gt=0, description="relative change that puts a pixel into the region")
+    ball: int = Field(256, ge=1)
+    calibration: int = Field(32, ge=1)
+    environment: int = Field(64, ge=1)
+    environment_width: int = Field(512, ge=16)
+    depth: int = Field(10, ge=2)
+
+
+class SimulatedScene(Strict):
+    """SCENE.toml."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
+    title: str
+    seed: int = Field(ge=0)
+    camera: CameraModel
+    sensor: SensorModel
+    light: LightFacts
+    table: TableFacts
+    board: BoardFacts
+    board_print: PrintFacts = PrintFacts()
+    ball: BallModel
+    plate: ViewFacts
+    ball_view: list[ViewFacts] = Field(min_length=1)
+    object: list[ObjectModel] = Field([], description="what really stands there in the truth")
+    calibration: list[BoardPhoto] = Field([], description="none: capture.toml gives the intrinsics")
+    bracket: BracketFacts = BracketFacts()
+    sampling: SamplingFacts = SamplingFacts()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SimulatedScene:
+        names = [self.plate.name, *[view.name for view in self.ball_view]]
+        if names[0] != "plate" or len(set(names)) < len(names):
+            raise ValueError(f"views are {names}; expected 'plate' first and unique names")
+        if self.plate.position_m is None:
+            raise ValueError("plate: has no position_m; it is required")
+        missing = [v.name for v in [self.plate, *self.ball_view] if (v.position_m is None) != (v.target_m is None)]
+        if missing:
+            raise ValueError(f"views {missing}: position_m and target_m go together")
+        return self
+
+
+def load_scene(path: Path) -> SimulatedScene:
+    """Read and validate SCENE.toml. Raises ManifestError with every problem at once."""
+    data = load_toml(path)
+    try:
+        return SimulatedScene.model_validate(data)
+    except ValidationError as error:
+        raise ManifestError(*problems_of(error, path, SimulatedScene)) from error

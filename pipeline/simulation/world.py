@@ -1,0 +1,174 @@
+"""The simulated place as a Mitsuba scene: distant room, table with the print let into it, photographer, ball, objects.
+
+Everything is given to Mitsuba as ACEScg arrays (raw textures); its rgb variants only multiply and add channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.simulation import light, shapes, surfaces
+from pipeline.simulation.scene_file import SimulatedScene
+from pipeline.simulation.sensor import acescg_from_rec709
+
+PEOPLE_ALBEDO = (0.07, 0.06, 0.06)
+BODY_ALBEDO = (0.03, 0.03, 0.03)
+
+
+def texture(mi: Any, pixels: np.ndarray) -> dict[str, Any]:
+    """A linear, unconverted Mitsuba texture of (H, W, 3); its first row is at v = 0."""
+    return {"type": "bitmap", "data": mi.TensorXf(pixels), "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+
+
+def colour(value: Any) -> dict[str, Any]:
+    """A constant (3,) spectrum, unconverted."""
+    return {"type": "rgb", "value": [float(v) for v in value]}
+
+
+def mesh(mi: Any, name: str, parts: shapes.Mesh, bsdf: Any, uv: np.ndarray | None = None, smooth: bool = True) -> Any:
+    """A Mitsuba mesh of vertices, normals and faces, in the world frame."""
+    vertices, normals, faces = parts
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    made = mi.Mesh(
+        name,
+        len(vertices),
+        len(faces),
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    parameters["faces"] = np.ravel(faces).astype(np.uint32)
+    if smooth:
+        parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    if uv is not None:
+        parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    parameters.update()
+    return made
+
+
+def rectangles(spans: list[tuple[float, float, float, float]], whole: tuple[float, float, float, float]) -> Any:
+    """Mesh and uv of rectangles (x0, z0, x1, z1) at y = 0, facing up; uv (0, 0) is x0, z0 of ``whole``."""
+    corners = np.array([[[x0, z0], [x0, z1], [x1, z1], [x1, z0]] for x0, z0, x1, z1 in spans]).reshape(-1, 2)
+    vertices = np.stack([corners[:, 0], 0 * corners[:, 0], corners[:, 1]], -1)
+    first = 4 * np.arange(len(spans))[:, None]
+    faces = np.concatenate([first + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])
+    uv = (corners - whole[:2]) / (np.array(whole[2:]) - whole[:2])
+    return (vertices, np.tile([0.0, 1.0, 0.0], (len(vertices), 1)), faces), uv
+
+
+@dataclass
+class Place:
+    """Builds the scenes of one simulation; textures are made once."""
+
+    mi: Any
+    scene: SimulatedScene
+    _surfaces: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def ball_centre(self) -> np.ndarray:
+        """(3,) world, metres."""
+        x, z = self.scene.ball.position_m
+        return np.array([x, self.scene.ball.diameter_m / 2, z])
+
+    def paper(self) -> tuple[float, float, float, float]:
+        """(x0, z0, x1, z1) of the printed sheet."""
+        board = self.scene.board
+        margin = board.margin_m
+        return (
+            -margin,
+            -margin,
+            board.squares[0] * board.square_m + margin,
+            board.squares[1] * board.square_m + margin,
+        )
+
+    def table_and_board(self) -> dict[str, Any]:
+        """The table top around the sheet, and the sheet, in one plane: no gap, no overlap."""
+        if self._surfaces:
+            return self._surfaces
+        mi, table = self.mi, self.scene.table
+        x0, z0, x1, z1 = whole = (table.x_m[0], table.z_m[0], table.x_m[1], table.z_m[1])
+        px0, pz0, px1, pz1 = paper = self.paper()
+        around = [(x0, z0, x1, pz0), (x0, pz1, x1, z1), (x0, pz0, px0, pz1), (px1, pz0, x1, pz1)]
+        wood = texture(mi, surfaces.table_texture(table, self.scene.seed))
+        if table.roughness is None:
+            material: dict[str, Any] = {"type": "diffuse", "reflectance": wood}
+        else:
+            material = {"type": "insitu_gltf", "base_color": wood, "metallic": 0.0, "roughness": table.roughness}
+        print_pixels = surfaces.board_texture(self.scene.board, self.scene.board_print)
+        for name, spans, extent, bsdf in (
+            ("table", around, whole, material),
+            ("board", [paper], paper, {"type": "diffuse", "reflectance": texture(mi, print_pixels)}),
+        ):
+            parts, uv = rectangles(spans, extent)
+            self._surfaces[name] = mesh(mi, name, parts, mi.load_dict(bsdf), uv, smooth=False)
+        return self._surfaces
+
+    def room(self) -> dict[str, Any]:
+        """The distant light."""
+        bitmap = self.mi.Bitmap(light.mitsuba_envmap(self.scene.light))
+        return {"room": {"type": "envmap", "bitmap": bitmap}}
+
+    def photographer(self, world_from_camera: np.ndarray) -> dict[str, Any]:
+        """Camera, tripod column and a person behind it, none of it in front of the lens."""
+        mi = self.mi
+        position, forward = world_from_camera[:3, 3], world_from_camera[:3, 2]
+        back = -np.array([forward[0], 0, forward[2]]) / np.hypot(forward[0], forward[2])
+        dark = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour(BODY_ALBEDO)}}
+        cloth = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour(PEOPLE_ALBEDO)}}
+        to_world = world_from_camera.copy()
+        to_world[:3, 3] = position - 0.055 * forward
+        person = position + 0.38 * back
+
+        def rod(start: np.ndarray, end: np.ndarray, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+            return {"type": "cylinder", "p0": start.tolist(), "p1": end.tolist(), "radius": radius, "bsdf": bsdf}
+
+        column = position + 0.06 * back
+        top, hip = np.array([person[0], 0.36 + position[1], person[2]]), np.array([person[0], -0.75, person[2]])
+        return {
+            "camera_body": {
+                "type": "cube", "bsdf": dark,
+                "to_world": mi.ScalarTransform4f(to_world @ np.diag([0.065, 0.045, 0.05, 1.0])),
+            },
+            "column": rod(column - [0, 0.05, 0], np.array([column[0], -0.75, column[2]]), 0.02, dark),
+            "torso": rod(hip, top - [0, 0.12, 0], 0.17, cloth),
+            "shoulders": {"type": "sphere", "center": (top - [0, 0.12, 0]).tolist(), "radius": 0.17, "bsdf": cloth},
+            "head": {"type": "sphere", "center": (top - [0, -0.16, 0]).tolist(), "radius": 0.11, "bsdf": cloth},
+        }  # fmt: skip
+
+    def ball(self, black: bool = False) -> dict[str, Any]:
+        """The mirror ball, perfectly smooth, its reflectance the same at all angles; or a black one in its place."""
+        mirror = {"type": "conductor", "material": "none", "specular_reflectance": colour(self.scene.ball.reflectance)}
+        if black:
+            mirror = {"type": "diffuse", "reflectance": colour((0.0, 0.0, 0.0))}
+        radius = self.scene.ball.diameter_m / 2
+        return {"ball": {"type": "sphere", "center": self.ball_centre.tolist(), "radius": radius, "bsdf": mirror}}
+
+    def objects(self) -> dict[str, Any]:
+        """Every object as a Mitsuba mesh, where it stands."""
+        made = {}
+        for model in self.scene.object:
+            vertices, normals, faces = shapes.build(model)
+            cosine, sine = np.cos(np.radians(model.yaw_deg)), np.sin(np.radians(model.yaw_deg))
+            turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+            x, z = model.position_m
+            placed = (vertices @ turn.T + [x, 0, z], normals @ turn.T, faces)
+            base = acescg_from_rec709() @ shapes.stored_colour(model)
+            bsdf = {
+                "type": "insitu_gltf", "base_color": colour(base),
+                "metallic": model.metallic, "roughness": model.roughness,
+            }  # fmt: skip
+            made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, self.mi.load_dict(bsdf))
+        return made
+
+    def load(self, *parts: dict[str, Any]) -> Any:
+        """A Mitsuba scene of the table, the board, the room and the given parts."""
+        scene: dict[str, Any] = {"type": "scene", **self.table_and_board(), **self.room()}
+        for part in parts:
+            scene.update(part)
+        return self.mi.load_dict(scene)

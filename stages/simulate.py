@@ -1,0 +1,272 @@
+"""Makes a capture with known truth from a SCENE.toml: RAW brackets, board photographs, objects, and the answer.
+
+A Mitsuba scene in ACEScg is photographed through a distorted, slightly soft lens onto a Bayer sensor with photon noise,
+read noise, fixed pattern, hot photosites and clipping, and written as DNGs whose shutter labels are rounded as cameras
+round them. The truth is path traced with the objects really standing there, with the glTF material, through the same
+lens; pixels that the objects cover or change get most of the samples. Plate and truth share their random numbers, so
+their difference is quieter than either; the stated noise is measured from two independent halves.
+
+Imports nothing that estimates. Limits: the room is infinitely far away, no depth of field, no vignetting, no flare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.run.errors import ManifestError
+from pipeline.run.formats import write_bytes
+from pipeline.simulation import capture, shapes
+from pipeline.simulation.lens import Lens, aim, blur, look_at
+from pipeline.simulation.photograph import (
+    Measure,
+    camera_rays,
+    first_hit,
+    latlong_rays,
+    mirrored_radiance,
+    path_radiance,
+    picture,
+    surface_albedo,
+    trace,
+)
+from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts, load_scene
+from pipeline.simulation.world import Place
+
+HELP = "Make a capture with known truth from SCENE.toml into the folder OUT."
+SMOOTHING_PX = 5.0  # of the light that the ball throws
+REGION_GROWTH = 3  # pixels added round the region that gets more samples
+
+
+@dataclass
+class Studio:
+    """The loaded scene description, Mitsuba, and the seeds of each picture."""
+
+    scene: SimulatedScene
+    mi: Any
+    place: Place
+    lens: Lens
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) of a photograph."""
+        return self.lens.height, self.lens.width
+
+    def pose(self, view: ViewFacts) -> np.ndarray:
+        """world_from_camera of a view; without its own position it is the plate's."""
+        position = view.position_m or self.scene.plate.position_m
+        target = view.target_m or self.scene.plate.target_m
+        return look_at(np.array(position), np.array(target))
+
+    def radiance(self, *parts: dict[str, Any]) -> Measure:
+        """Path-traced radiance of the place with these parts in it."""
+        return path_radiance(self.mi, self.place.load(*parts), self.scene.sampling.depth)
+
+    def photograph(self, measure: Measure, pose: np.ndarray, samples: int, seed: int) -> np.ndarray:
+        """(H, W, K) before the lens' blur."""
+        passes = self.scene.sampling.pass_samples
+        return picture(self.mi, camera_rays(self.mi, self.lens, pose), measure, self.shape, samples, passes, seed)
+
+
+def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> None:
+    """Write the capture that ``scene_toml`` describes into ``out``.
+
+    Raises ManifestError for a bad scene file, or when ``out`` exists and is not empty.
+    """
+    from pipeline.transport.variant import use_mitsuba
+
+    scene = load_scene(scene_toml)
+    if out.exists() and any(out.iterdir()):
+        raise ManifestError(f"{out}: is not empty; a capture is written into a new folder")
+    mi = use_mitsuba()
+    studio = Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera))
+    shoot = capture.Shoot(scene, out, capture.sensor_of(scene))
+    for model in scene.object:
+        shapes.write_glb(out / "objects" / f"{model.name}.glb", shapes.build(model), model)
+    capture.write_manifests(scene, out)
+    views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view]}
+    take_calibration(studio, shoot, progress)
+    pictures = {view.name: ball_picture(studio, view, progress) for view in scene.ball_view}
+    pictures["plate"], noise = plate_truth(studio, out, progress)
+    capture.take_brackets(shoot, pictures)
+    surface_truth(studio, out, views["plate"], progress)
+    record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, noise)
+    capture.write_truth(out / "truth" / "truth.json", record)
+    progress(f"{scene.name}: {len(shoot.exposures)} RAW frames, {len(scene.calibration)} board photographs")
+
+
+def board_pose(scene: SimulatedScene, lens: Lens, photo: BoardPhoto) -> np.ndarray:
+    """world_from_camera of a calibration photograph."""
+    board = scene.board
+    centre = np.array([board.squares[0] * board.square_m / 2, 0.0, board.squares[1] * board.square_m / 2])
+    tilt, azimuth = np.radians(photo.tilt_deg), np.radians(photo.azimuth_deg)
+    offset = np.array([np.sin(tilt) * np.sin(azimuth), np.cos(tilt), np.sin(tilt) * np.cos(azimuth)])
+    pose = look_at(centre + photo.distance_m * offset, centre, np.radians(photo.roll_deg))
+    x, y = lens.ideal_from_pixel(photo.at[0] * lens.width, photo.at[1] * lens.height)
+    return aim(pose, (float(x), float(y)))
+
+
+def take_calibration(studio: Studio, shoot: capture.Shoot, progress: Callable[[str], None]) -> None:
+    """The board photographs."""
+    measure = studio.radiance()
+    for number, photo in enumerate(studio.scene.calibration):
+        progress(f"board photograph {number + 1} of {len(studio.scene.calibration)}")
+        pose = board_pose(studio.scene, studio.lens, photo)
+        raw = studio.photograph(measure, pose, studio.scene.sampling.calibration, 900_000 + 1000 * number)
+        data = capture.srgb_jpeg(blur(raw, studio.scene.camera.blur_sigma_px), shoot.sensor, number)
+        write_bytes(shoot.out / "calibration" / f"calib_{number:02d}.jpg", data)
+
+
+def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None]) -> np.ndarray:
+    """(H, W, 3) radiance of a ball view, through the lens.
+
+    Light that the ball throws onto the table is hard to sample: it would speckle the picture. It is smooth, since the
+    ball is convex, so it is found as the difference from a black ball under the same random numbers and smoothed, as
+    irradiance on the table and as radiance in the ball; its energy is kept.
+    """
+    progress(f"{view.name}: mirror ball")
+    scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
+    pose = studio.pose(view)
+    people = place.photographer(pose)
+    seed = 100_000 * (2 + [v.name for v in scene.ball_view].index(view.name))
+    mirror = studio.photograph(studio.radiance(people, place.ball()), pose, sampling.ball, seed)
+    dark = place.load(people, place.ball(black=True))
+    ball = next(shape for shape in dark.shapes() if shape.id() == "ball")
+    base = mirrored_radiance(studio.mi, dark, sampling.depth, ball, scene.ball.reflectance)
+    black = studio.photograph(base, pose, sampling.ball, seed)
+    cover = studio.photograph(first_hit(studio.mi, dark, [ball]), pose, sampling.pass_samples, seed)
+    surfaces = surface_albedo(studio.mi, dark, list(place.table_and_board().values()))
+    albedo = studio.photograph(surfaces, pose, sampling.pass_samples, seed)
+    thrown = spread_light(mirror - black, albedo, cover)
+    return blur(black + thrown, scene.camera.blur_sigma_px)
+
+
+def spread_light(light: np.ndarray, albedo: np.ndarray, cover: np.ndarray) -> np.ndarray:
+    """Smooth the light (H, W, 3) thrown by the ball within the table and within the ball.
+
+    ``albedo``: (H, W, 4), of the surfaces times their coverage, and their coverage; ``cover``: (H, W, 1) of the ball.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    def within(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        near = gaussian_filter(weight, SMOOTHING_PX)
+        sums = gaussian_filter(values * weight[..., None], (SMOOTHING_PX, SMOOTHING_PX, 0))
+        return sums / np.maximum(near, 1e-9)[..., None] * (near > 1e-6)[..., None]
+
+    table = (albedo[..., 3] > 0.999).astype(float)
+    irradiance = within(light / np.maximum(albedo[..., :3], 1e-3), table)
+    return albedo[..., :3] * irradiance + cover * within(light, (cover[..., 0] > 0.999).astype(float))
+
+
+def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> tuple[np.ndarray, dict[str, float]]:
+    """Write plate.exr, with_objects.exr and coverage.exr; returns the plate (H, W, 3) and the measured noise."""
+    scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
+    pose, sigma = studio.pose(scene.plate), studio.scene.camera.blur_sigma_px
+    people, objects = place.photographer(pose), place.objects()
+    with_scene = place.load(people, objects)
+    progress("coverage of the objects")
+    hits = first_hit(studio.mi, with_scene, list(objects.values()))
+    seen = studio.photograph(hits, pose, 4 * sampling.pass_samples, 50_000) if objects else np.zeros((*studio.shape, 0))
+    coverage = blur(seen, sigma)
+    plate = path_radiance(studio.mi, place.load(people), sampling.depth)
+    filled = path_radiance(studio.mi, with_scene, sampling.depth)
+    progress(f"plate and with_objects: whole picture, {sampling.plate} samples")
+    raw = {"plate": studio.photograph(plate, pose, sampling.plate, 1)}
+    raw["with_objects"] = studio.photograph(filled, pose, sampling.plate, 1)
+    region = changed_region(raw, coverage, sigma, sampling.region_threshold)
+    covered = grow(seen.sum(-1) > 0)
+    half = np.zeros(raw["plate"].shape)
+    refine(studio, plate, raw["plate"], half, region, sampling.region, 10_000, progress)
+    refine(studio, filled, raw["with_objects"], half, region & ~covered, sampling.region, 10_000, progress)
+    refine(studio, filled, raw["with_objects"], half, covered, sampling.object, 30_000, progress)
+    pictures = {name: blur(values, sigma) for name, values in raw.items()}
+    for name, pixels in pictures.items():
+        capture.write_picture(out / "truth" / f"{name}.exr", pixels)
+    names = [model.name for model in scene.object]
+    capture.write_layers(
+        out / "truth" / "coverage.exr", {n: coverage[..., i] for i, n in enumerate(names)}, studio.shape
+    )
+    noise = measured_noise(pictures, blur(half, sigma), coverage.sum(-1), region)
+    return pictures["plate"], noise | {
+        "spp": sampling.object,
+        "spp_shadow": sampling.region,
+        "spp_else": sampling.plate,
+    }
+
+
+def changed_region(raw: dict[str, np.ndarray], coverage: np.ndarray, sigma: float, threshold: float) -> np.ndarray:
+    """(H, W) bool: where the objects are seen, or change the picture by more than the threshold on 5x5 means."""
+    change = box_mean(np.linalg.norm(blur(raw["with_objects"] - raw["plate"], sigma), axis=-1))
+    relative = change / np.linalg.norm(blur(raw["plate"], sigma), axis=-1)
+    return grow(relative > threshold) | grow(coverage.sum(-1) > 0)
+
+
+def refine(
+    studio: Studio, measure: Measure, raw: np.ndarray, half: np.ndarray, where: np.ndarray, samples: int, seed: int,
+    progress: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Replace pixels of ``raw`` by their mean over many passes, and of ``half`` by half the two halves' difference."""
+    sampling = studio.scene.sampling
+    passes = max(2, round(samples / sampling.region_pass))
+    pixels = np.flatnonzero(where)
+    if not len(pixels):
+        return
+    shoot = camera_rays(studio.mi, studio.lens, studio.pose(studio.scene.plate))
+    sums = np.zeros((2, len(pixels), 3))
+    for number in range(passes):
+        progress(f"{len(pixels)} pixels in detail, pass {number + 1} of {passes}")
+        sums[number % 2] += trace(studio.mi, shoot, measure, pixels, min(samples, sampling.region_pass), seed + number)
+    raw[where] = sums.sum(0) / passes
+    half[where] = (sums[0] / ((passes + 1) // 2) - sums[1] / (passes // 2)) / 2
+
+
+def measured_noise(
+    pictures: dict[str, np.ndarray], half_difference: np.ndarray, coverage: np.ndarray, region: np.ndarray
+) -> dict[str, float]:
+    """Median relative standard deviation of the truth on the objects and in their shadows (change over 5 %)."""
+    truth, plate = pictures["with_objects"], pictures["plate"]
+    rms = np.sqrt(box_mean((half_difference**2).sum(-1)))
+    relative = rms / np.linalg.norm(truth, axis=-1)
+    inside = box_mean(region.astype(float)) > 0.999
+    changed = np.linalg.norm(truth - plate, axis=-1) > 0.05 * np.linalg.norm(plate, axis=-1)
+    masks = {"object": inside & (coverage > 0.999), "shadow": inside & (coverage == 0) & changed}
+    found: dict[str, float] = {"region_fraction": float(region.mean())}
+    for name, mask in masks.items():
+        if mask.any():
+            found[f"{name}_median_rel"] = float(np.median(relative[mask]))
+        found[f"{name}_pixels"] = int(mask.sum())
+    return found
+
+
+def surface_truth(studio: Studio, out: Path, pose: np.ndarray, progress: Callable[[str], None]) -> None:
+    """Write albedo.exr (as the plate's camera sees it) and environment.exr (at the ball's centre)."""
+    scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
+    progress("albedo and environment")
+    surfaces = place.table_and_board()
+    albedo = surface_albedo(studio.mi, place.load(), list(surfaces.values()))
+    pixels = blur(studio.photograph(albedo, pose, sampling.pass_samples, 60_000), scene.camera.blur_sigma_px)
+    capture.write_picture(out / "truth" / "albedo.exr", pixels[..., :3], {"seen": pixels[..., 3]}, "1")
+    height, width = sampling.environment_width // 2, sampling.environment_width
+    shoot = latlong_rays(studio.mi, place.ball_centre, width, height)
+    measure = studio.radiance(place.photographer(pose))
+    light = picture(
+        studio.mi, shoot, measure, (height, width), sampling.environment, sampling.pass_samples, 70_000
+    )  # fmt: skip
+    capture.write_picture(out / "truth" / "environment.exr", light)
+
+
+def box_mean(values: np.ndarray, half: int = 2) -> np.ndarray:
+    """Mean over a square of (2 half + 1)^2 pixels; edges repeat."""
+    for axis in (0, 1):
+        wide = np.pad(values, [(half, half) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
+        shifted = [np.take(wide, range(k, k + values.shape[axis]), axis) for k in range(2 * half + 1)]
+        values = sum(shifted[1:], shifted[0]) / (2 * half + 1)
+    return values
+
+
+def grow(mask: np.ndarray) -> np.ndarray:
+    """The mask and what lies within REGION_GROWTH pixels of it."""
+    return box_mean(mask.astype(float), REGION_GROWTH) > 0.5 / (2 * REGION_GROWTH + 1) ** 2
