@@ -1,10 +1,11 @@
 """Intrinsics and distortion from board photographs, with covariance; the distortion model is chosen by held-out error.
 
 Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
-(Gauss-Newton, poses eliminated). Models none, k1, k1 k2, and Brown's five are tried, then separate fx and fy; a richer
-one is taken only where photographs it was not fitted to improve by more than three standard errors. Covariance:
-inverse normal matrix of the chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all
-photographs; a flat board; terms left out have no variance, so the evidence says what they could cost.
+(Gauss-Newton, poses eliminated). From one focal length without distortion, the terms k1, k2, separate fx and fy, p1 p2
+and k3 are offered in turn, twice; a term stays when photographs that it was not fitted to gain more than 9 in deviance
+per parameter (three standard errors of a Gaussian) and do so consistently. Covariance: inverse normal matrix of the
+chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all photographs; a flat board; terms left
+out have no variance, so the evidence says what they could cost.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from pipeline.run.stage import Stage
 from pipeline.types import Camera, Result
 from stages import knobs
 
-LADDER: tuple[tuple[str, ...], ...] = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2", "k3"))
+LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",))
 FEWEST_CORNERS = 8  # of a photograph that is used
 FEWEST_PHOTOS = 3
-NEEDED_SIGMAS = 3.0  # improvement of the held-out error that buys a richer model
+NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
+NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
 GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
 CORNER_SIGMA_PX = 0.1
 TILT_DEG = 10.0  # boards all nearer than this to parallel to the sensor do not separate focal length from distance
@@ -120,7 +122,7 @@ def drop_bad(
     start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str]
 ) -> tuple[Photos, list[np.ndarray]]:
     """Leave out single wrong corners, and photographs whose residual is far above the typical one."""
-    fit = fit_model(start, poses, photos, ("k1", "k2"), True)
+    fit = fit_model(start, poses, photos, ("k1", "k2"))
     scale = max(robust_scale(np.concatenate(fit.residuals_px)), 0.02)
     rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
     limit = GATE * max(float(np.median(rms)), scale)
@@ -140,20 +142,17 @@ def drop_bad(
     return Photos(photos.files, world_m, px), [fit.poses[i] for i in rest]
 
 
-def fit_model(
-    start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...], one_focal: bool
-) -> Adjustment:
-    """Adjust with these distortion terms free and the others zero."""
-    free = free_columns(terms, one_focal)
+def fit_model(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> Adjustment:
+    """Adjust with these terms free and the others zero; without "fy" one focal length serves both axes."""
+    one_focal = "fy" not in terms
+    free = free_columns(tuple(term for term in terms if term != "fy"), one_focal)
     values = lens_vector(start) * (free.sum(1) > 0)
     if one_focal:
         values[:2] = values[:2].mean()
     return adjust(with_lens(start, values), poses, photos.world_m, photos.px, free)
 
 
-def held_out(
-    start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...], one_focal: bool
-) -> np.ndarray:
+def held_out(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> np.ndarray:
     """Mean squared residual (photos,) px^2 of each photograph under a lens fitted to the others (five folds)."""
     count = len(photos.files)
     folds = min(5, count)
@@ -161,52 +160,78 @@ def held_out(
     for fold in range(folds):
         train = [i for i in range(count) if i % folds != fold]
         try:
-            lens = fit_model(start, [poses[i] for i in train], photos.only(train), terms, one_focal).camera
+            lens = fit_model(start, [poses[i] for i in train], photos.only(train), terms).camera
             for i in range(fold, count, folds):
                 every = np.ones(len(photos.px[i]), bool)
                 seen = refine(lens, poses[i], photos.world_m[i], photos.px[i], CORNER_SIGMA_PX, every)
                 errors[i] = (seen.residuals_px**2).sum(-1).mean()
         except NumericalError:
-            continue  # too rich for this fold: its error stays infinite and the model is not taken
+            continue  # too rich for this fold: its error stays infinite and the term is not taken
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def climb(
     start: Camera, poses: list[np.ndarray], photos: Photos
 ) -> tuple[Adjustment, dict[str, float], list[dict[str, Any]]]:
-    """Take richer models while photographs they have not seen say so; with the reason for each step."""
+    """Add terms while photographs that they were not fitted to gain by them; with the reason for each."""
     terms: tuple[str, ...] = ()
-    one_focal = True
-    best = held_out(start, poses, photos, terms, one_focal)
+    best = held_out(start, poses, photos, terms)
+    corners = np.array([len(px) for px in photos.px])
     errors = {"none": float(np.sqrt(best.mean()))}
-    steps = [(rung, True) for rung in LADDER[1:]] + [((), False)]
-    evidence = []
-    for rung, tied in steps:
-        tried = (rung, tied) if tied else (terms, False)
-        name = " ".join(rung) if tied else "fx and fy apart"
-        error = held_out(start, poses, photos, *tried)
-        errors[name] = float(np.sqrt(error.mean()))
-        sigmas = improvement(best, error)
-        taken = sigmas > NEEDED_SIGMAS
-        because = f"held-out error {np.sqrt(best.mean()):.4f} -> {errors[name]:.4f} px, {sigmas:+.1f} sigma (needs 3)"
-        entry = {"term": f"lens: {name}", "modelled": taken, "because": because, "could_cost": ""}
-        evidence.append((entry, tried))
-        if taken:
-            best, (terms, one_focal) = error, tried
-    chosen = fit_model(start, poses, photos, terms, one_focal)
-    for entry, tried in evidence:
-        if not entry["modelled"] and np.isfinite(errors[str(entry["term"]).removeprefix("lens: ")]):
-            shift = disagreement(chosen.camera, fit_model(start, poses, photos, *tried).camera)
-            entry["could_cost"] = f"{shift:.3f} px rms over the frame"
-    return chosen, errors, [entry for entry, _ in evidence]
+    evidence: dict[tuple[str, ...], dict[str, Any]] = {}
+    for _ in range(2):  # a term may pay only once a later one is in
+        before = terms
+        for step in LADDER:
+            if set(step) <= set(terms):
+                continue
+            error = held_out(start, poses, photos, terms + step)
+            gain, consistency = improvement(best, error, corners)
+            taken = gain > NEEDED_DEVIANCE * len(step) and consistency > NEEDED_CONSISTENCY
+            errors[" ".join(terms + step)] = float(np.sqrt(error.mean()))
+            because = (
+                f"held-out error {np.sqrt(best.mean()):.4f} -> {np.sqrt(error.mean()):.4f} px: gain in deviance "
+                f"{gain:.1f} (needs {NEEDED_DEVIANCE * len(step):g}), photographs agree at {consistency:+.1f} sigma"
+            )
+            evidence[step] = {"term": f"lens {' '.join(step)}", "modelled": taken, "because": because, "could_cost": ""}
+            if taken:
+                best, terms = error, terms + step
+        if terms == before:
+            break
+    chosen = fit_model(start, poses, photos, terms)
+    for step, entry in evidence.items():
+        if not entry["modelled"]:
+            entry["could_cost"] = cost_of(step, terms, chosen, start, poses, photos)
+    return chosen, errors, list(evidence.values())
 
 
-def improvement(before: np.ndarray, after: np.ndarray) -> float:
-    """Mean gain of the held-out error over the photographs in its standard errors."""
+def cost_of(
+    step: tuple[str, ...],
+    terms: tuple[str, ...],
+    chosen: Adjustment,
+    start: Camera,
+    poses: list[np.ndarray],
+    photos: Photos,
+) -> str:
+    """How far the lens with the term left out would be from the chosen one."""
+    try:
+        shift = disagreement(chosen.camera, fit_model(start, poses, photos, terms + step).camera)
+    except NumericalError:
+        return "unknown: these photographs do not determine it"
+    return f"{shift:.3f} px rms over the frame"
+
+
+def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:
+    """Gain in deviance of the held-out corners, and the photographs' mean gain in its standard errors.
+
+    The latter on logarithms, as distortion costs a board in the corner of the frame a hundred times what it costs one
+    in the middle: the plain mean would carry the scatter of the photographs, not of the models.
+    """
     if not np.isfinite(after).all():
-        return -np.inf
-    gain = before - after
-    return float(gain.mean() / max(gain.std(ddof=1) / np.sqrt(len(gain)), 1e-12))
+        return -np.inf, -np.inf
+    variance = max(float((corners * after).sum() / (2 * corners.sum())), 1e-12)  # of one coordinate
+    gain = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
+    scatter = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
+    return float((corners * (before - after)).sum() / variance), float(gain.mean() / scatter)
 
 
 def disagreement(first: Camera, second: Camera) -> float:

@@ -49,7 +49,7 @@ def compute(
     corners, kept = modelled_rectangle(ground, params.extent * size, view)
     if kept < 1:
         warnings.append(
-            f"plane: the rectangle is cut to {kept:.0%} of its margin, as it reached behind the plate camera"
+            f"plane: the margin of the rectangle is cut to {kept:.0%} towards the plate camera, as it reached behind it"
         )
     spots = feet or {"marker": ground.mean(0)}
     contact = {name: sigma for name, spot in spots.items() if np.isfinite(sigma := contact_sigma(camera, view, spot))}
@@ -114,8 +114,10 @@ def modelled_rectangle(ground: np.ndarray, margin_m: float, view: View) -> tuple
     (x_low, _, z_low), (x_high, _, z_high) = ground.min(0), ground.max(0)
 
     def corners(share: float) -> np.ndarray:
-        add = share * margin_m
-        x0, x1, z0, z1 = x_low - add, x_high + add, z_low - add, z_high + add
+        # Only the sides whose way outward leads towards the camera are drawn in.
+        x_minus, z_minus = np.where(view.world_from_camera[[0, 2], 2] > 0, share, 1.0) * margin_m
+        x_plus, z_plus = np.where(view.world_from_camera[[0, 2], 2] < 0, share, 1.0) * margin_m
+        x0, x1, z0, z1 = x_low - x_minus, x_high + x_plus, z_low - z_minus, z_high + z_plus
         return np.array([[x0, 0, z1], [x1, 0, z1], [x1, 0, z0], [x0, 0, z0]])
 
     def nearest(points: np.ndarray) -> float:

@@ -55,7 +55,7 @@ def straightened(distorted: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Undistorted coordinates by the plain fixed-point iteration, another way than the project's Newton."""
     k1, k2, p1, p2, k3 = distortion
     x, y = distorted.T
-    for _ in range(40 if np.any(distortion) else 0):
+    for _ in range(15 if np.any(distortion) else 0):
         s = x * x + y * y
         radial = 1 + s * (k1 + s * (k2 + s * k3))
         bend_x, bend_y = 2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y
