@@ -99,14 +99,15 @@ def score(
             f"evaluate: composite {composite.shape}, plate {plate.shape}, truth {truth.plate.shape}; sizes must agree"
         )
     (composite, bad), (plate, bad_plate) = metrics.finite(composite), metrics.finite(plate)
-    scale = metrics.scale_of(plate, truth.plate)
+    plate_box, true_box = metrics.box(plate), metrics.box(truth.plate)
+    scale = metrics.scale_of(plate_box, true_box)
     scaled = scale * truth.with_objects
     with ThreadPoolExecutor(2) as pool:  # FLIP releases the GIL, the rest runs beside it
         looks = [pool.submit(_perceptual, p, scaled, pixels_per_degree) for p in (composite, plate)]
-        ref = metrics.reference(truth.with_objects, truth.plate, truth.coverage, scale)
-        maps = metrics.error_maps(composite, plate, ref)
+        ref = metrics.reference(truth.with_objects, true_box, truth.coverage, scale)
+        maps = metrics.error_maps(composite, metrics.box(composite), plate_box, ref)
         found = metrics.errors(maps, ref)
-        nothing = metrics.errors(metrics.error_maps(plate, plate, ref), ref)
+        nothing = metrics.errors(metrics.error_maps(plate, plate_box, plate_box, ref), ref)
         (seen, flip_map), (seen_nothing, _) = (look.result() for look in looks)
     found |= {**seen, "scale": scale, "non_finite": bad, "non_finite_plate": bad_plate}
     found |= {"pixels_per_degree": pixels_per_degree, "object_pixels": int(ref.inside.sum())}

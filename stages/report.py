@@ -85,7 +85,7 @@ def section(build: Build, name: str) -> dict[str, Any]:
     seconds = record.get("seconds")
     return {
         "name": name, "title": title, "text": text,
-        "seconds": f"{fig.short(seconds)} s" if seconds is not None else "",
+        "seconds": f"{seconds:.2f} s" if seconds is not None else "",
         "numbers": fig.readings(record.get("numbers") or {}), "warnings": record.get("warnings") or [],
         "evidence": [
             {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
@@ -133,7 +133,7 @@ def times(records: dict[str, Any]) -> list[dict[str, Any]]:
         {
             "name": name,
             "share": f"{seconds:.3f}",
-            "text": f"{fig.short(seconds)} s",
+            "text": f"{seconds:.2f} s",
             "colour": COLOURS[i % len(COLOURS)],
         }
         for i, (name, seconds) in enumerate(spent)

@@ -35,8 +35,8 @@ def scene():
 
 def figures(composite, plate, scene, scale=1.0):
     true_plate, truth, coverage = scene
-    ref = metrics.reference(truth, true_plate, coverage, scale)
-    return metrics.errors(metrics.error_maps(composite, plate, ref), ref)
+    ref = metrics.reference(truth, metrics.box(true_plate), coverage, scale)
+    return metrics.errors(metrics.error_maps(composite, metrics.box(composite), metrics.box(plate), ref), ref)
 
 
 def test_truth_has_no_error(scene):
@@ -59,7 +59,7 @@ def test_half_the_change_is_half_wrong(scene):
 def test_exposure_does_not_matter(scene):
     plate, truth, _ = scene
     composite = truth * 1.03
-    scale = metrics.scale_of(4 * plate, plate)
+    scale = metrics.scale_of(metrics.box(4 * plate), metrics.box(plate))
     assert scale == pytest.approx(4)
     first, second = figures(composite, plate, scene), figures(4 * composite, 4 * plate, scene, scale)
     first.pop("object_rel_err_of"), second.pop("object_rel_err_of")
@@ -69,7 +69,7 @@ def test_exposure_does_not_matter(scene):
 
 def test_classes_do_not_overlap(scene):
     plate, truth, coverage = scene
-    ref = metrics.reference(truth, plate, coverage, 1.0)
+    ref = metrics.reference(truth, metrics.box(plate), coverage, 1.0)
     assert set(np.unique(ref.classes)) == {0, 1, 2, 3, 4}
     assert not (ref.shadow & ref.faint).any()
     assert not ((ref.shadow | ref.faint) & ref.covered).any()
@@ -153,13 +153,13 @@ def test_agrees_with_the_independent_script(tmp_path):
     mask = formats.read_png(capture / "truth/mask_objects.png")
     mask = mask / np.iinfo(mask.dtype).max
     coverage = dict(zip(("grey", "red", "gold"), np.moveaxis(mask[..., :3], -1, 0)))
-    scale = metrics.scale_of(plate, true_plate)
+    scale = metrics.scale_of(metrics.box(plate), metrics.box(true_plate))
     assert scale == pytest.approx(theirs["scale"], rel=1e-6)
     for picture, expected in ((composite, theirs), (plate, theirs["do_nothing"])):
         ours = figures(picture.astype(float), plate.astype(float), (true_plate, truth, coverage), scale)
         for key in ours.keys() & expected.keys():
             assert ours[key] == pytest.approx(expected[key], rel=1e-4), key
-    ref = metrics.reference(truth, true_plate, coverage, scale)
+    ref = metrics.reference(truth, metrics.box(true_plate), coverage, scale)
     counts = {
         f"{n}_pixels": int(m.sum()) for n, m in (("object", ref.inside), ("shadow", ref.shadow), ("faint", ref.faint))
     }

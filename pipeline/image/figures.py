@@ -177,7 +177,7 @@ def reading(key: str, value: Any) -> str:
         return f"{value:,}".replace(",", " ") + next((u for e, u in UNITS.items() if key.endswith(e)), "")
     if isinstance(value, float):
         if key.endswith(SHARES) and np.isfinite(value):
-            return f"{short(100 * value)} %"
+            return "< 0.0001 %" if 0 < abs(value) < 1e-6 else f"{short(100 * value)} %"
         return short(value) + next((u for e, u in UNITS.items() if key.endswith(e)), "")
     if isinstance(value, (list, tuple)):
         shown = [reading(key, v) for v in value[:8]]

@@ -52,7 +52,7 @@ section { border-top: 1px solid var(--rule); padding: 1.7rem 0 .6rem; margin-top
 .tag { position: absolute; top: 11px; padding: 3px 10px; border-radius: 20px; background: #000a; color: #fff;
   font: 600 12px/18px system-ui, sans-serif; pointer-events: none; }
 .tag.l { left: 11px; } .tag.r { right: 11px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(196px, 1fr)); gap: .75rem; margin: 1rem 0; }
+.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(176px, 1fr)); gap: .75rem; margin: 1rem 0; }
 .card { background: var(--card); border-radius: 7px; padding: .75rem .9rem .7rem; border-left: 4px solid var(--none); }
 .card.good { border-left-color: var(--good); } .card.fair { border-left-color: var(--fair); }
 .card.bad { border-left-color: var(--bad); }
@@ -63,6 +63,8 @@ section { border-top: 1px solid var(--rule); padding: 1.7rem 0 .6rem; margin-top
 .bad .verdict { color: var(--bad); }
 .figs { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1.1rem; margin: 1rem 0;
   align-items: start; }
+.figs:has(> figure:only-child) { grid-template-columns: minmax(0, 640px); }
+.tables { display: flex; flex-wrap: wrap; gap: 0 3rem; } .tables > div { min-width: 0; max-width: 100%; }
 figure { margin: 0; } figure.wide { grid-column: 1 / -1; } .figs.three { grid-template-columns: repeat(3, 1fr); }
 .frame { position: relative; border-radius: 5px; overflow: hidden; background: #777; line-height: 0; cursor: zoom-in; }
 .frame img { width: 100%; height: auto; display: block; }
@@ -126,7 +128,8 @@ TEMPLATE = """<!doctype html>
  aria-hidden="true">
 {%- for l in f.lines %}<polyline class="{{ l.style }}" points="{{ l.points }}"/>{% endfor %}
 {%- for t in f.labels %}<text x="{{ '%.1f' | format(t.x) }}" y="{{ '%.1f' | format(t.y) }}"
- font-size="{{ '%.1f' | format(f.size[0] / 46) }}">{{ t.text }}</text>{% endfor %}</svg>{% endif %}</div>
+ font-size="{{ (f.size[0] / (52 if f.width == 'wide' else 25)) | round(1) }}">
+{{- t.text }}</text>{% endfor %}</svg>{% endif %}</div>
 {%- if f.bar %}<div class="ramp"><span>{{ f.bar.low }}</span><i class="{{ f.bar.kind }}"></i>
 <span>{{ f.bar.high }}</span></div>{% endif %}
 {%- if f.legend %}<div class="legend">{% for c, t in f.legend %}<span><i style="background:{{ c }}"></i>{{ t }}</span>
@@ -157,8 +160,8 @@ TEMPLATE = """<!doctype html>
 {{ cards(headline) }}
 {%- if headline_note %}<p class="lead">{{ headline_note }}</p>{% endif %}
 {%- if warning_count %}<div class="warn">{{ warning_count }}
- warning{{ 's' if warning_count > 1 }} below: {% for s in sections if s.warnings %}<a href="#{{ s.name }}">{{ s.name }}
-</a>{{ ', ' if not loop.last }}{% endfor %}.</div>{% endif %}
+ warning{{ 's' if warning_count > 1 }} below: {% for s in sections if s.warnings %}<a href="#{{ s.name }}">
+{{- s.name }}</a>{{ ', ' if not loop.last }}{% endfor %}.</div>{% endif %}
 {%- if ball %}<section id="ball"><div class="sechead"><h2>The ball, photographed and rendered</h2></div>
 <p class="lead">{{ ball.text }}</p>{% for row in ball.rows %}<div class="figs three">
 {%- for f in row %}{{ figure(f) }}{% endfor %}</div>{% endfor %}</section>{% endif %}
@@ -168,7 +171,7 @@ TEMPLATE = """<!doctype html>
 {%- for w in s.warnings %}<div class="warn">{{ w }}</div>{% endfor %}
 {%- if s.cards %}{{ cards(s.cards) }}{% endif %}
 {%- if s.figures %}<div class="figs">{% for f in s.figures %}{{ figure(f) }}{% endfor %}</div>{% endif %}
-{%- for t in s.tables %}{{ table(t) }}{% endfor %}
+{%- if s.tables %}<div class="tables">{% for t in s.tables %}<div>{{ table(t) }}</div>{% endfor %}</div>{% endif %}
 {%- if s.numbers %}{% if s.numbers | length > 16 %}<details><summary>All {{ s.numbers | length }} measured
  numbers</summary>{% else %}<h3>Measured</h3>{% endif %}<div class="two">{% for k, v in s.numbers %}
 <div class="row"><span>{{ k }}</span><span>{{ v }}</span></div>{% endfor %}</div>

@@ -149,22 +149,24 @@ def merge_part(build: Build) -> dict[str, Any]:
     tables = []
     for view, frames in build.exposures.items():
         rows = [
-            [f["file"], shutter(f["label_s"]), f"{100 * (f['estimated_s'] / f['label_s'] - 1):+.2f} %",
+            [f["file"], shutter(f["label_s"]),
+             f"{100 * (f['estimated_s'] / f['label_s'] - 1):+.2f} %".replace("-", "−"),
              fig.reading("_rel", f["sigma_rel"]), fig.reading("_fraction", f["clipped_fraction"])]
             for f in frames if f.get("label_s")
         ]  # fmt: skip
         tables.append({"title": view, "head": head, "rows": rows, "numeric": True})
     shown = []
     for name, raster in build.photographs.items():
-        mask = pictures.first_bit(reduced_mask(raster["mask"]))
-        if mask.any():
+        mask = reduced_mask(raster["mask"])
+        if (mask & np.uint32(CLIPPED | DARK | GHOST)).any():  # defects alone are a number, not a picture
+            mask = pictures.first_bit(mask)
             shown.append(fig.class_figure(mask, MASKS, f"{name}, masks", "worst of each block of pixels"))
     return {"tables": tables, "figures": shown}
 
 
 def reduced_mask(mask: np.ndarray) -> np.ndarray:
     """A bit mask at about WIDTH columns, bits joined over each block: no defect is too small to be seen."""
-    factor = max(1, mask.shape[1] // WIDTH)
+    factor = max(1, round(mask.shape[1] / WIDTH))
     rows, columns = (side // factor for side in mask.shape)
     blocks = mask[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor).astype(np.uint32)
     joined = np.bitwise_or.reduce(np.bitwise_or.reduce(blocks, 3), 1)
@@ -184,7 +186,7 @@ def develop_part(build: Build) -> dict[str, Any]:
             fig.photo(
                 pictures.thumbnail(raster.rgb(), WIDTH, exposure), name, "at the plate's exposure" * (name != "plate")
             )
-            for name, raster in build.photographs.items()
+            for name, raster in sorted(build.photographs.items(), key=lambda item: item[0] != "plate")
         ]
     }
 
@@ -244,7 +246,7 @@ def probe_part(build: Build) -> dict[str, Any]:
     labels = []
     for direction, text in zip([*np.eye(3), *-np.eye(3)], ("+x", "+y", "+z", "−x", "−y", "−z")):
         u, v = latlong_from_direction(direction)
-        labels.append(fig.Label(float(u) * width, float(np.clip(v, 0.05, 0.97)) * height, text))
+        labels.append(fig.Label(float(np.clip(u, 0.02, 0.98)) * width, float(np.clip(v, 0.05, 0.97)) * height, text))
     horizon = fig.Line(f"0,{height / 2} {width},{height / 2}", "horizon")
     caption = "world frame, centre +z, horizon dashed"
     shown = [

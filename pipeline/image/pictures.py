@@ -21,8 +21,8 @@ NOT_KNOWN = (110, 114, 120)  # where a map holds no number
 
 
 def shrink(picture: np.ndarray, width: int) -> np.ndarray:
-    """Area mean by the whole factor that brings (H, W, ...) to at least ``width`` columns; a rest is cut off."""
-    factor = max(1, picture.shape[1] // width)
+    """Area mean by the whole factor that brings (H, W, ...) nearest to ``width`` columns; a rest is cut off."""
+    factor = max(1, round(picture.shape[1] / width))
     if factor == 1:
         return picture
     rows, columns = (side // factor for side in picture.shape[:2])
