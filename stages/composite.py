@@ -65,8 +65,8 @@ def compute(photographs: dict[str, Raster], layers: Raster, params: knobs.Compos
     warnings = []
     if numbers["guard_clipped_plate_px"]:
         warnings.append(
-            f"composite: the light changes on {numbers['guard_clipped_plate_px']} px where the plate is clipped; their true "
-            "value is unknowable, add a shorter plate frame"
+            f"composite: the light changes on {numbers['guard_clipped_plate_px']} px where the plate is clipped; their "
+            "true value is unknowable, add a shorter plate frame"
         )
     outputs = {
         "composite": Raster(channels, ACESCG, {"insitu:layers": "R,G,B = plate * mul + add + obj"}),

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.camera.lens import project
 from pipeline.conventions import ACESCG, CLIPPED, invert_rigid, transform_points
 from pipeline.light.environment import irradiance
+from pipeline.light.sampling import bilinear, planes
 from pipeline.run import artifacts as A
 from pipeline.run.errors import NumericalError
 from pipeline.run.stage import Stage
@@ -21,7 +22,7 @@ from pipeline.transport.reflectance import fill_unseen, updated_brdf
 from pipeline.types import Camera, Plane, Raster, Result, View
 from stages import knobs
 
-MAX_SUPERSAMPLE = 3
+MAX_SUPERSAMPLE = 2
 
 
 def texel_centres(plane: Plane, height: int, width: int, splits: int) -> np.ndarray:
@@ -36,22 +37,18 @@ def texel_centres(plane: Plane, height: int, width: int, splits: int) -> np.ndar
 
 def read_plate(plate: Raster, camera: Camera, view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Plate radiance (H, W, 3) averaged over the sub-texels (S, H, W, 3), and the share of them that is seen (H, W)."""
-    from scipy.ndimage import map_coordinates
-
     rgb = plate.rgb()
     usable = np.all(np.isfinite(rgb), -1) & ((plate["mask"] & CLIPPED) == 0)
-    total = np.zeros((*points.shape[1:3], 3))
-    seen = np.zeros(points.shape[1:3])
-    clean = np.where(usable[..., None], rgb, 0.0)
+    picture = planes(np.concatenate([np.where(usable[..., None], rgb, 0.0), usable[..., None]], -1))
+    camera_from_world = invert_rigid(view.world_from_camera)
+    total = np.zeros((*points.shape[1:3], 4))
     for sub in points:
-        px = project(camera, transform_points(invert_rigid(view.world_from_camera), sub.reshape(-1, 3)))
-        inside = np.all(np.isfinite(px), -1)
-        where = np.where(inside[:, None], px - 0.5, -10.0).T[::-1]
-        share = map_coordinates(usable.astype(np.float32), where, order=1, cval=0.0).reshape(seen.shape)
-        values = [map_coordinates(clean[..., c], where, order=1, cval=0.0).reshape(seen.shape) for c in range(3)]
-        total += np.stack(values, -1)
-        seen += share
-    return total / np.maximum(seen, 1e-6)[..., None], seen / len(points)
+        px = project(camera, transform_points(camera_from_world, sub.reshape(-1, 3))).reshape(*sub.shape[:2], 2)
+        inside = np.all((px >= 0) & (px <= (camera.width, camera.height)), -1)  # False for NaN: not imaged
+        px = np.where(inside[..., None], px, 0.0)
+        total += np.where(inside[..., None], bilinear(picture, px[..., 0], px[..., 1]), 0.0)
+    seen = total[..., 3]
+    return total[..., :3] / np.maximum(seen, 1e-6)[..., None], seen / len(points)
 
 
 def compute(
@@ -62,7 +59,7 @@ def compute(
     plane: Plane,
     params: knobs.Reflectance,
 ) -> Result:
-    """Albedo texture of the plane, ACEScg. Raises NumericalError when no light arrives or the plate does not show it."""
+    """Albedo texture, ACEScg. Raises NumericalError when no light arrives or the plate does not show the plane."""
     plate, view = photographs["plate"], views["plate"]
     light = irradiance(environment.rgb(), plane.normal[None])[0]
     if not np.all(light > 0):
@@ -109,8 +106,8 @@ def judge(measured: np.ndarray, light: np.ndarray, albedo: np.ndarray) -> tuple[
     if above > 0.01:
         scale = float(np.quantile(measured, 0.99))
         warnings.append(
-            f"albedo: {above:.1%} of the seen texels exceed 1 (99 % quantile {scale:.2f}), needed <= 1; the probe is too dark "
-            f"by up to {scale:.2f} x: check the ball's reflectance, clipped lights, and exposure between plate and ball"
+            f"albedo: {above:.1%} of the seen texels exceed 1 (99 % quantile {scale:.2f}), needed <= 1; the probe is too "
+            f"dark by up to {scale:.2f} x: check the ball's reflectance, clipped lights, and exposure between plate and ball"
         )
     return numbers, warnings
 

@@ -174,7 +174,9 @@ def to_layers(
         "variance": samples.change_variance * fade**2,
         "objvariance": samples.obj_variance,
     }
-    channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(place(rgb), layer).items()}
+    channels = {
+        name: values for layer, rgb in layers.items() for name, values in Raster.split(place(rgb), layer).items()
+    }
     channels |= {"obj.A": place(samples.alpha), "ground": place(samples.ground), "influence": weight}
     return Raster(channels, ACESCG)
 
@@ -194,7 +196,9 @@ def measure(
     if bare.any():
         level, noise = np.linalg.norm(model[bare], axis=1), np.sqrt(samples.change_variance[bare].sum(1))
         numbers["change_noise_rel"] = float(np.median(noise / level))
-        numbers["deepest_shadow"] = float(np.quantile((samples.lost + samples.gained)[bare].sum(1) / model[bare].sum(1), 0.001))
+        numbers["deepest_shadow"] = float(
+            np.quantile((samples.lost + samples.gained)[bare].sum(1) / model[bare].sum(1), 0.001)
+        )
         if params.strategy == "reference":
             numbers["noobj_over_closed_form"] = float(samples.without[bare].sum() / model[bare].sum())
     if covered.any():

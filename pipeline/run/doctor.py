@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 
-REQUIRED = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "mitsuba", "OpenEXR", "colour-science", "rawpy")
+NEEDED = "numpy scipy opencv-contrib-python-headless pycolmap mitsuba OpenEXR colour-science rawpy opencolorio"
 COSTS = {
     "cuda_ad_rgb": "the fastest",
     "llvm_ad_rgb": "the usual one without a GPU",
@@ -28,7 +28,7 @@ def examine() -> tuple[list[str], bool]:
     """Lines to print, and whether everything needed was found."""
     lines = [f"python      {sys.version.split()[0]} at {sys.prefix}"]
     healthy = True
-    for name in REQUIRED:
+    for name in NEEDED.split():
         try:
             lines.append(f"{name:<32} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
@@ -41,10 +41,10 @@ def examine() -> tuple[list[str], bool]:
     else:
         healthy = False
         reason = (result.stderr.strip().splitlines() or [f"exit code {result.returncode}"])[-1]
-        lines.append(f"renderer    NONE: {reason}; INSITU_VARIANT=scalar_rgb renders without LLVM, about 5 times slower")
+        lines.append(f"renderer    NONE: {reason}; INSITU_VARIANT=scalar_rgb needs no LLVM, 5 x slower")
     cores, memory = os.cpu_count() or 1, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     lines.append(f"cores       {cores}" + ("" if cores > 1 else ": rendering takes about twice as long as with two"))
-    lines.append(f"memory      {memory:.1f} GiB" + ("" if memory >= 4 else ": little; 24 Mpx captures need about 4 GiB"))
+    lines.append(f"memory      {memory:.1f} GiB" + ("" if memory >= 4 else ": 24 Mpx captures need about 4 GiB"))
     gpu = os.path.exists("/dev/nvidiactl")
     lines.append("GPU         " + ("found" if gpu else "none: LLVM renders on the cores"))
     return lines, healthy

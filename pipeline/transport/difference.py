@@ -5,8 +5,8 @@ At a point x of a convex local scene the two worlds differ only in directions th
     LS_obj - LS_noobj = rho_d  integral over the objects' solid angle of (L_object - L_distant) cos(theta) dw
 
 so only those directions are sampled. The lost light, ``-L_distant``, combines samples of the lights with samples of the
-cones around the objects' bounding spheres by multiple importance sampling (balance heuristic, Veach and Guibas 1995); the
-gained light, ``L_object``, follows the cone samples with an ordinary path tracer, so colour bleeding, mirrors and
+cones around the objects' bounding spheres by multiple importance sampling (balance heuristic, Veach and Guibas 1995);
+the gained light, ``L_object``, follows the cone samples with an ordinary path tracer, so colour bleeding, mirrors and
 caustics of every order are in it. LS_noobj is not rendered: it is ``rho_d E`` in closed form (equation 7). Unbiased;
 equal to the reference strategy in the mean (tested).
 """

@@ -1,7 +1,7 @@
 """Rays through the photographed lens, and the reference strategy: two full path-traced images.
 
-A camera sample that meets an object goes to the object layer (premultiplied); one that meets the local scene contributes
-to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and edges are
+A camera sample that meets an object goes to the object layer (premultiplied); one that meets the local scene
+contributes to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and edges are
 exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The reference traces
 every sample in both worlds with the same random numbers; `pipeline.transport.difference` is the fast strategy.
 """
@@ -76,7 +76,6 @@ class Samples:
         }
         return cls(**arrays, not_finite=sum(part.not_finite for part in parts))
 
-
     def merged(self, index: np.ndarray, other: Samples, share: float) -> Samples:
         """Pixels ``index`` averaged with ``other``, which has weight ``share``; the rest as they are."""
         result = {}
@@ -93,9 +92,9 @@ class Samples:
 class Strategy(Protocol):
     """Traces one block of pixels; see `reference_block` and `pipeline.transport.difference.difference_block`."""
 
-    def __call__(
-        self, worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float
-    ) -> Samples: ...
+    def __call__(self, worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
+        """Samples of every pixel of ``rays``."""
+        ...
 
 
 def trace(
