@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.lens import project
-from pipeline.camera.markers import fit_marker, luminance, marker_points, tone
+from pipeline.camera.markers import fit_marker, grey, marker_points, tone
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px
 from pipeline.camera.resection import Resection, is_planar, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference, nearest_rotation
@@ -111,7 +111,7 @@ def check_sizes(photographs: dict[str, Raster], camera: Camera, names: list[str]
 
 def sight(facts: dict[str, Any], name: str, order: dict[str, Any], photograph: Raster, camera: Camera) -> Sightings:
     """Corners of the board, or the four corners of the marker, in one view."""
-    radiance = luminance(photograph.rgb())
+    radiance = grey(photograph.rgb())
     if order["route"] == "charuco":
         board = facts["board"]
         total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
