@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.run.errors import ManifestError
+from pipeline.run.errors import ManifestError, ToolError
 from pipeline.run.formats import write_bytes
 from pipeline.simulation import capture, shapes
 from pipeline.simulation.lens import Lens, aim, blur, look_at
@@ -74,7 +74,8 @@ class Studio:
 def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> None:
     """Write the capture that ``scene_toml`` describes into ``out``.
 
-    Raises ManifestError for a bad scene file, or when ``out`` exists and is not empty.
+    Raises ManifestError for a bad scene file, or when ``out`` is not empty; ToolError when Mitsuba can only run
+    its scalar variants.
     """
     from pipeline.transport.variant import use_mitsuba
 
@@ -82,6 +83,8 @@ def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> No
     if out.exists() and any(out.iterdir()):
         raise ManifestError(f"{out}: is not empty; a capture is written into a new folder")
     mi = use_mitsuba()
+    if mi.variant().startswith("scalar"):
+        raise ToolError("simulate: Mitsuba runs without LLVM and CUDA; one of them is needed; run insitu doctor")
     studio = Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera))
     shoot = capture.Shoot(scene, out, capture.sensor_of(scene))
     for model in scene.object:
