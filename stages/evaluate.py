@@ -22,6 +22,7 @@ from pipeline.camera.rigid import difference
 from pipeline.conventions import transform_points
 from pipeline.image import metrics
 from pipeline.image.colour import convert
+from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
 from pipeline.light import prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
@@ -102,8 +103,10 @@ def score(
     plate_box, true_box = metrics.box(plate), metrics.box(truth.plate)
     scale = metrics.scale_of(plate_box, true_box)
     scaled = scale * truth.with_objects
+    exposure = auto_exposure(scaled)
+    coded = metrics.coded(scaled, exposure)
     with ThreadPoolExecutor(2) as pool:  # FLIP releases the GIL, the rest runs beside it
-        looks = [pool.submit(_perceptual, p, scaled, pixels_per_degree) for p in (composite, plate)]
+        looks = [pool.submit(_perceptual, p, coded, exposure, pixels_per_degree) for p in (composite, plate)]
         ref = metrics.reference(truth.with_objects, true_box, truth.coverage, scale)
         maps = metrics.error_maps(composite, metrics.box(composite), plate_box, ref)
         found = metrics.errors(maps, ref)
@@ -118,11 +121,11 @@ def score(
 
 
 def _perceptual(
-    picture: np.ndarray, truth: np.ndarray, pixels_per_degree: float
+    picture: np.ndarray, truth: np.ndarray, exposure_ev: float, pixels_per_degree: float
 ) -> tuple[dict[str, float], np.ndarray]:
-    pair = metrics.coded_pair(picture, truth)
-    flip, flip_map = metrics.flip(*pair, pixels_per_degree)
-    return {"flip": flip, "psnr": metrics.psnr(*pair), "ssim": metrics.ssim(*pair)}, flip_map
+    picture = metrics.coded(picture, exposure_ev)
+    flip, flip_map = metrics.flip(picture, truth, pixels_per_degree)
+    return {"flip": flip, "psnr": metrics.psnr(picture, truth), "ssim": metrics.ssim(picture, truth)}, flip_map
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> float | None:

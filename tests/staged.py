@@ -64,7 +64,9 @@ def artifacts() -> dict[str, Any]:
     found["albedo"] = acescg(np.full((32, 32, 3), ALBEDO), seen=np.ones((32, 32)))
     photographs = {"plate": acescg(np.full((HEIGHT, WIDTH, 3), 0.2), mask=np.zeros((HEIGHT, WIDTH)))}
     for name, ball in balls.items():
-        photographs[name] = acescg(ball_photograph(camera, views[name], ball, light), mask=np.zeros((HEIGHT, WIDTH)))
+        photographs[name] = acescg(
+            ball_photograph(camera, views[name], ball, light, name == "ball_a"), mask=np.zeros((HEIGHT, WIDTH))
+        )
     found["photographs"] = {
         name: Raster({**raster.channels, **Raster.split(np.full((HEIGHT, WIDTH, 3), 1e-6), "variance")}, "acescg")
         for name, raster in photographs.items()
@@ -88,7 +90,7 @@ def acescg(rgb, layers=None, **more) -> Raster:
     return Raster(channels, "acescg")
 
 
-def ball_photograph(camera, view, ball, light) -> np.ndarray:
+def ball_photograph(camera, view, ball, light, with_shadow) -> np.ndarray:
     """The plate, darkened by the ball's exact shadow with one mirror bounce, and the ball in front."""
     whole = slice(0, HEIGHT), slice(0, WIDTH)
     plane = Plane(normal=NORMAL, offset_m=0, covariance=np.zeros((3, 3)), corners_m=np.zeros((4, 3)), source="board")
@@ -97,7 +99,8 @@ def ball_photograph(camera, view, ball, light) -> np.ndarray:
     picture = np.full((HEIGHT * WIDTH, 3), 0.2)
     near = np.isfinite(hits[:, 0]) & (np.linalg.norm(hits - CENTRE, axis=-1) < 5.5 * RADIUS)
     near &= np.linalg.norm(hits - CENTRE, axis=-1) > RADIUS * 1.001
-    for part in np.array_split(np.flatnonzero(near), 40):
+    shaded = np.flatnonzero(near & with_shadow)
+    for part in np.array_split(shaded, 10):
         picture[part] *= prediction.ball_shadow(light, hits[part], NORMAL, CENTRE, RADIUS, np.ones(3))[1]
     picture = picture.reshape(HEIGHT, WIDTH, 3)
     directions, sine = prediction.ball_directions(camera, ball, view.world_from_camera, *whole)

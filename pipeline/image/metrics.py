@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.image.colour import convert, encode_srgb
-from pipeline.image.display import auto_exposure
 
 SHADOW, FAINT = 0.05, 0.005  # change that makes a shadow pixel, and a faint one
 BOX, GROW, SHRINK = 5, 7, 3  # px
@@ -134,15 +133,14 @@ def _quantile(values: np.ndarray, fraction: float) -> float | None:
     return float(np.quantile(values, fraction)) if values.size else None
 
 
-def coded_pair(composite: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both as sRGB pictures in [0, 1], float32, exposed so that the median of the truth is at mid grey, then clipped.
+def coded(picture: np.ndarray, exposure_ev: float) -> np.ndarray:
+    """An sRGB picture in [0, 1], float32, of ACEScg (H, W, 3); clipped. The perceptual figures compare such pictures.
 
-    Plain sRGB, no tone curve: the perceptual figures must not depend on the display transform in use.
+    Plain sRGB, no tone curve: those figures must not depend on the display transform in use. Expose by the truth's
+    `auto_exposure`, so that its median is at mid grey.
     """
-    gain = 2.0 ** auto_exposure(truth)
-    linear = [convert(gain * picture, "acescg", "linear_rec709") for picture in (composite, truth)]
-    first, second = (encode_srgb(np.clip(picture, 0, 1)).astype(np.float32) for picture in linear)
-    return first, second
+    linear = convert(np.asarray(picture, np.float32) * np.float32(2.0**exposure_ev), "acescg", "linear_rec709")
+    return encode_srgb(np.clip(linear, 0, 1)).astype(np.float32)
 
 
 def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
