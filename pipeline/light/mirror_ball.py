@@ -58,9 +58,7 @@ def incidence(theta: np.ndarray, ratio: float) -> np.ndarray:
     return angle
 
 
-def rays_from_directions(
-    directions: np.ndarray, to_camera: np.ndarray, ratio: float
-) -> tuple[np.ndarray, np.ndarray]:
+def rays_from_directions(directions: np.ndarray, to_camera: np.ndarray, ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Unit rays from the camera (..., 3) that the ball reflects to unit ``directions`` (..., 3), same frame.
 
     Also returns the sine of the incidence (...), NaN in the blind cone. ``to_camera`` (3,) is the unit direction from
@@ -156,4 +154,4 @@ def _pixels(camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     x = xy[..., 0] * np.float32(camera.fx) + np.float32(camera.cx)
     y = xy[..., 1] * np.float32(camera.fy) + np.float32(camera.cy)
     inside = (x >= 0.5) & (x <= camera.width - 0.5) & (y >= 0.5) & (y <= camera.height - 0.5) & (rays[..., 2] > 0)
-    return x, y, inside
+    return np.where(inside, x, 0), np.where(inside, y, 0), inside
