@@ -51,6 +51,8 @@ IRRADIANCE_MAP = (128, 256)  # truth and map are averaged to this before the irr
 PAIR_MAP = (64, 128)  # texels on which two ball views are compared: 2.8 deg
 BALL_LIMIT = 0.9  # of the ball's radius: beyond, a pixel spans many degrees
 GRID, REACH = 32, 5.0  # points per side and half side in ball radii of the shadow check
+UNCHANGED = 0.01  # predicted change by the ball below which a spot of the plane tells the exposure
+GAIN_WARNING, MIN_GAIN_POINTS = 0.01, 50
 STRIDE = 2  # albedo is compared at every second pixel
 
 
@@ -63,7 +65,8 @@ def compute(
     plate = photographs["plate"].rgb()
     checks = self_check(facts, photographs, camera, views, balls, environment, plane, albedo)
     same, fraction = metrics.untouched(composite.rgb(), plate, layers["influence"], layers["obj.A"])
-    warnings = [] if same else ["pixels outside the region of influence differ from the plate; report this"]
+    warnings = exposure_warnings(checks)
+    warnings += [] if same else ["pixels outside the region of influence differ from the plate; report this"]
     if not facts.get("truth_path"):
         nothing = Raster({"class": np.zeros((1, 1), np.uint32)}, ERROR_MAP.space)
         outputs = {"metrics": {}, "selfcheck": checks, "error_map": nothing}
@@ -237,7 +240,11 @@ def shadow_check(
     photographs: dict[str, Raster], name: str, camera: Camera, view: View, ball: BallFit, light: np.ndarray,
     plane: Plane, reflectance: np.ndarray,
 ) -> dict[str, Any]:  # fmt: skip
-    """The ball's shadow on the plane, predicted from the map and measured as ball photograph over plate."""
+    """The ball's shadow on the plane, predicted from the map and measured as ball photograph over plate.
+
+    Where the ball changes next to nothing the two photographs should agree: what they differ by there is ``gain``, an
+    error of exposure between ball and plate, and it is taken out before the shapes of the shadows are compared.
+    """
     centre = transform_points(view.world_from_camera, ball.centre_camera_m)
     foot = centre - (centre @ plane.normal - plane.offset_m) * plane.normal
     along = plane.corners_m[1] - plane.corners_m[0]
@@ -252,13 +259,27 @@ def shadow_check(
     if not usable.any():
         return {"points": 0}
     blocked, mirrored = prediction.ball_shadow(light, points[usable], plane.normal, centre, ball.radius_m, reflectance)
-    seen = measured[usable].mean(-1)
-    found: dict[str, Any] = {"points": int(usable.sum()), "median_measured_ratio": float(np.median(seen))}
+    far = np.abs(mirrored - 1).max(-1) < UNCHANGED
+    gain = np.median(measured[usable][far] / mirrored[far], axis=0) if far.any() else np.ones(3)
+    seen = (measured[usable] / gain).mean(-1)
+    found: dict[str, Any] = {"points": int(usable.sum()), "gain": float(gain.mean()), "gain_rgb": gain.tolist()}
+    found |= {"gain_points": int(far.sum()), "median_measured_ratio": float(np.median(measured[usable].mean(-1)))}
     for key, ratio in (("blocked_only", blocked.mean(-1)), ("with_mirror", mirrored.mean(-1))):
         found[f"{key}_median_abs_err"] = float(np.median(np.abs(ratio - seen)))
         moving = min(np.std(ratio), np.std(seen)) > 0
         found[f"{key}_correlation"] = float(np.corrcoef(ratio, seen)[0, 1]) if moving else None
     return found
+
+
+def exposure_warnings(checks: dict[str, Any]) -> list[str]:
+    """A line for each ball view whose exposure disagrees with the plate's on the table beyond its shadow."""
+    return [
+        f"{name}: {abs(shadow['gain'] - 1):.1%} {'darker' if shadow['gain'] < 1 else 'brighter'} than the plate on "
+        f"{shadow['gain_points']} spots of the plane that the ball leaves alone; exposure labels or lamps differ, "
+        "and the light is off by as much; shoot one setting that plate and ball share"
+        for name, shadow in checks["shadow"].items()
+        if shadow.get("gain_points", 0) >= MIN_GAIN_POINTS and abs(shadow["gain"] - 1) > GAIN_WARNING
+    ]
 
 
 def paper_check(board: dict[str, Any], plane: Plane, albedo: Raster) -> dict[str, Any]:

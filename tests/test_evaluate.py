@@ -127,6 +127,7 @@ def test_self_check_of_a_perfect_capture(everything):
     # 5x5 means over a curved shadow.
     assert shadow["with_mirror_median_abs_err"] < 0.005
     assert shadow["with_mirror_correlation"] > 0.98
+    assert shadow["gain"] == pytest.approx(1, abs=1e-3)
     assert checks["paper"]["albedo"] == pytest.approx([staged.ALBEDO] * 3)
     assert checks["paper"]["neutrality"] == pytest.approx(1)
 
@@ -137,6 +138,17 @@ def test_self_check_sees_a_map_turned_by_ten_degrees(everything):
     right = run(everything).outputs["selfcheck"]["ball"]["ball_a"]["median_rel_err"]
     wrong = run(everything, environment=turned).outputs["selfcheck"]["ball"]["ball_a"]["median_rel_err"]
     assert wrong > 20 * right
+
+
+def test_wrong_exposure_of_the_ball_is_found_on_the_table(everything):
+    ball = everything["photographs"]["ball_a"]
+    darker = Raster({k: v * np.float32(0.97) if k in "RGB" else v for k, v in ball.channels.items()}, "acescg")
+    result = run(everything, photographs={**everything["photographs"], "ball_a": darker})
+    shadow = result.outputs["selfcheck"]["shadow"]["ball_a"]
+    assert shadow["gain"] == pytest.approx(0.97, abs=1e-3)
+    assert shadow["with_mirror_median_abs_err"] < 0.005  # the shape is judged without it
+    assert any("3.0% darker" in warning for warning in result.warnings)
+    assert run(everything).warnings == []
 
 
 def test_score_files_of_anybody(everything, tmp_path):

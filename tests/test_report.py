@@ -147,6 +147,7 @@ def test_readings(key, value, text):
 def test_nested_numbers_become_rows():
     rows = fig.readings({"plate": {"rms_px": 0.5, "held_out": {"k1": 1.0}}})
     assert rows == [("plate · rms", "0.5 px"), ("plate · held out · k1", "1")]
+    assert fig.readings({"contact_px": {"cube": 0.25}}) == [("contact · cube", "0.25 px")]
 
 
 def test_lights():

@@ -185,19 +185,20 @@ def reading(key: str, value: Any) -> str:
     return str(value)
 
 
-def readings(values: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Nested numbers as flat rows (name, text); names keep their words and lose unit endings."""
+def readings(values: dict[str, Any], prefix: str = "", unit_key: str = "") -> list[tuple[str, str]]:
+    """Nested numbers as flat rows (name, text); names lose unit endings, and inherit the unit of what they are in."""
     rows: list[tuple[str, str]] = []
     for key, value in values.items():
         name = f"{prefix} · {words(key)}" if prefix else words(key)
+        known = key if key.endswith((*UNITS, *SHARES)) else unit_key or key
         if isinstance(value, dict):
-            rows += readings(value, name)
+            rows += readings(value, name, known)
         else:
-            rows.append((name, reading(key, value)))
+            rows.append((name, reading(known, value)))
     return rows
 
 
 def words(key: str) -> str:
     """A key as words, less its unit."""
-    ending = next((e for e in (*UNITS, "_fraction") if key.endswith(e) and len(key) > len(e)), "")
+    ending = next((e for e in (*UNITS, "_fraction", "_rel") if key.endswith(e) and len(key) > len(e)), "")
     return key.removesuffix(ending).replace("_", " ").strip() or key

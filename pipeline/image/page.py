@@ -64,6 +64,7 @@ section { border-top: 1px solid var(--rule); padding: 1.7rem 0 .6rem; margin-top
 .figs { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1.1rem; margin: 1rem 0;
   align-items: start; }
 .figs:has(> figure:only-child) { grid-template-columns: minmax(0, 640px); }
+.figs:has(> figure:nth-child(4):last-child):not(:has(> .wide)) { grid-template-columns: 1fr 1fr; }
 .tables { display: flex; flex-wrap: wrap; gap: 0 3rem; } .tables > div { min-width: 0; max-width: 100%; }
 figure { margin: 0; } figure.wide { grid-column: 1 / -1; } .figs.three { grid-template-columns: repeat(3, 1fr); }
 .frame { position: relative; border-radius: 5px; overflow: hidden; background: #777; line-height: 0; cursor: zoom-in; }
@@ -128,7 +129,7 @@ TEMPLATE = """<!doctype html>
  aria-hidden="true">
 {%- for l in f.lines %}<polyline class="{{ l.style }}" points="{{ l.points }}"/>{% endfor %}
 {%- for t in f.labels %}<text x="{{ '%.1f' | format(t.x) }}" y="{{ '%.1f' | format(t.y) }}"
- font-size="{{ (f.size[0] / (52 if f.width == 'wide' else 25)) | round(1) }}">
+ font-size="{{ (f.size[0] / {'wide': 52, 'half': 44}.get(f.width, 25)) | round(1) }}">
 {{- t.text }}</text>{% endfor %}</svg>{% endif %}</div>
 {%- if f.bar %}<div class="ramp"><span>{{ f.bar.low }}</span><i class="{{ f.bar.kind }}"></i>
 <span>{{ f.bar.high }}</span></div>{% endif %}

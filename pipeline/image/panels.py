@@ -29,6 +29,12 @@ GUARDS = {
 KINDS = [((24, 25, 27), "unchanged"), ((250, 170, 52), "object"), ((90, 140, 230), "shadow"),
          ((60, 80, 120), "faint shadow"), ((172, 49, 88), "edge")]  # fmt: skip
 # key, name, good at most, fair at most: the figures the project has set itself for a whole capture.
+NAMES = {
+    "object_rel_err": "object, relative error", "object_rel_err_p90": "object, worst tenth from",
+    "shadow_change_err": "shadow, error of the change", "shadow_change_err_p90": "shadow, worst tenth from",
+    "faint_change_err": "faint shadow, error of the change", "shadow_rel_err": "shadow, relative error",
+    "flip": "FLIP", "psnr": "PSNR [dB]", "ssim": "SSIM",
+}  # fmt: skip
 TARGETS = [
     ("object_rel_err", "object", 0.02, 0.05), ("shadow_change_err", "shadow, error of the change", 0.08, 0.15),
     ("faint_change_err", "faint shadow, error of the change", None, None), ("flip", "FLIP", None, None),
@@ -103,6 +109,9 @@ def checks(build: Build) -> list[dict[str, str]]:
             note = f"correlation {fig.reading('', shadow['with_mirror_correlation'])}, {shadow['points']} points"
             error = shadow["with_mirror_median_abs_err"]
             card(f"shadow of {name}, predicted", "_err", error, note, (0.03, 0.08))
+            if shadow["gain_points"]:
+                note = f"{shadow['gain_points']} spots of the plane that the ball leaves alone"
+                card(f"{name} against plate, exposure", "_err", abs(shadow["gain"] - 1), note, (0.01, 0.03))
     paper = found.get("paper", {})
     if paper.get("points"):
         grey = float(np.mean(paper["albedo"]))
@@ -208,7 +217,9 @@ def calibrate_part(build: Build) -> dict[str, Any]:
     caption = (
         f"at most {fig.short(known.max(initial=0.0))} px in the frame; the yellow grid shows it ten times exaggerated"
     )
-    return {"figures": [fig.photo(build.plate_picture, "Distortion", caption, size=build.frame, lines=lines)]}
+    return {
+        "figures": [fig.photo(build.plate_picture, "Distortion", caption, size=build.frame, lines=lines, width="half")]
+    }
 
 
 def pose_part(build: Build) -> dict[str, Any]:
@@ -279,18 +290,25 @@ def plane_part(build: Build) -> dict[str, Any]:
         if np.isfinite(px).all():
             labels.append(fig.Label(float(px[0]), float(px[1]) + 0.032 * build.frame[0], wish["name"]))
     caption = "yellow: the rectangle that is modelled, in tenths; orange: where the objects stand"
-    figure = fig.photo(build.plate_picture, "Plane", caption, size=build.frame, lines=lines, labels=labels)
+    figure = fig.photo(
+        build.plate_picture, "Plane", caption, size=build.frame, lines=lines, labels=labels, width="half"
+    )
     return {"figures": [figure]}
 
 
 def reflectance_part(build: Build) -> dict[str, Any]:
     """The albedo texture as it is, white paper near white."""
-    small = pictures.shrink(np.dstack([build.albedo.rgb(), build.albedo["seen"]]), WIDTH)
+    texture = np.dstack([build.albedo.rgb(), build.albedo["seen"]])
+    seen = np.argwhere(texture[..., 3] > 0.5)
+    if len(seen):  # what the plate shows, and a margin
+        (top, left), (bottom, right) = seen.min(0), seen.max(0)
+        texture = texture[max(0, top - 8) : bottom + 9, max(0, left - 8) : right + 9]
+    small = pictures.shrink(texture, WIDTH)
     coded = encode_srgb(np.clip(convert(small[..., :3], "acescg", "linear_rec709"), 0, 1))
     picture = (coded * 255 + 0.5).astype(np.uint8)
     picture = np.where((small[..., 3] > 0.5)[..., None], picture, (0.35 * picture + 70).astype(np.uint8))
     grey = luminance(small[..., :3])
-    caption = "of the rectangle from above, albedo 1 is white; veiled: not seen by the plate, filled in"
+    caption = "of the plane from above, albedo 1 is white; veiled: not seen by the plate, filled in"
     return {
         "figures": [
             fig.photo(picture, "Albedo", caption, 88),
@@ -310,14 +328,18 @@ def render_part(build: Build) -> dict[str, Any]:
     change = np.where(
         (touched > 0) & (before > 0), luminance(small["with"]) / np.where(before > 0, before, 1) - 1, np.nan
     )
-    shown = display_transform(small["obj"], exposure_ev=exposure)
-    straight = np.where(alpha[..., None] > 0, shown, 0)
+    opaque = small["obj"] / np.where(alpha > 0, alpha, 1)[..., None]
+    straight = np.where(alpha[..., None] > 0, display_transform(opaque, exposure_ev=exposure), 0)
     modelled = small["obj"] + (1 - alpha[..., None]) * small["with"]
-    veil = (touched > 0)[..., None]
+
+    def veiled(rgb: np.ndarray) -> np.ndarray:
+        known = ((touched > 0) & (luminance(rgb) > 0))[..., None]
+        return np.where(known, display_transform(rgb, exposure_ev=exposure), np.array(pictures.NOT_KNOWN, np.uint8))
+
     return {
         "figures": [
-            fig.photo(display_transform(modelled * veil, exposure_ev=exposure), "LS_obj", "the model with the objects"),
-            fig.photo(display_transform(small["without"] * veil, exposure_ev=exposure), "LS_noobj", "and without"),
+            fig.photo(veiled(modelled), "LS_obj", "the model with the objects; grey: left to the plate"),
+            fig.photo(veiled(small["without"]), "LS_noobj", "the local scene without them; grey: not needed"),
             fig.signed_figure(
                 change, 0.5, "LS_obj over LS_noobj", "on the local scene, luminance; grey: left to the plate"
             ),
@@ -369,9 +391,11 @@ def evaluate_part(build: Build) -> dict[str, Any]:
             ]
             continue
         good, fair = limits.get(key, (None, None))
-        ours = {"text": fig.reading(key, build.metrics[key]), "light": light_of(build.metrics[key], good, fair)}
+        ours: Any = fig.reading(key, build.metrics[key])
+        if good is not None:
+            ours = {"text": ours, "light": light_of(build.metrics[key], good, fair)}
         target = f"≤ {fig.reading(key, good)}" if good is not None else ""
-        rows.append([key.replace("_", " "), ours, fig.reading(key, nothing[key]), target])
+        rows.append([NAMES.get(key, key.replace("_", " ")), ours, fig.reading(key, nothing[key]), target])
     for name, value in (build.metrics.get("probe_irradiance_rel_err_of") or {}).items():
         rows.append([f"irradiance on a plane facing {name}", fig.reading("_err", value), "", ""])
     table = {"title": "Against truth", "head": ["", "ours", "doing nothing", "target"], "rows": rows, "numeric": True}
