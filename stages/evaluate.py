@@ -184,7 +184,12 @@ def albedo_errors(truth: Truth, camera: Camera, view: View, plane: Plane, albedo
         return {"albedo_rel_err": None, "albedo_known_fraction": 0.0}
     true = truth.albedo[rows[known], columns[known], :3]
     error = metrics.relative(ours[known, :3] - true, true)
-    return {"albedo_rel_err": float(np.median(error)), "albedo_known_fraction": float(known.mean())}
+    gain = metrics.norm(ours[known, :3]).sum() / metrics.norm(true).sum()  # a wrong light, apart from blur and noise
+    return {
+        "albedo_rel_err": float(np.median(error)),
+        "albedo_gain": float(gain),
+        "albedo_known_fraction": float(known.mean()),
+    }
 
 
 def self_check(

@@ -49,6 +49,7 @@ def test_perfect_result_scores_perfectly(everything, tmp_path):
     assert found["probe_irradiance_rel_err"] < 1e-6
     assert found["albedo_rel_err"] < 1e-6
     assert found["albedo_known_fraction"] == 1
+    assert found["albedo_gain"] == pytest.approx(1)
     assert found["shadow_outside_region"] == 0
     assert set(found["probe_irradiance_rel_err_of"]) == {"+x", "-x", "+y", "-y", "+z", "-z"}
 
@@ -186,6 +187,21 @@ def test_other_primaries_are_converted(tmp_path):
     primaries = (0.6401, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3295)
     formats.write_exr(tmp_path / "x.exr", Raster(Raster.split(rgb), "unknown", {"chromaticities": primaries}))
     assert np.allclose(read_acescg(tmp_path / "x.exr"), convert(rgb, "linear_rec709", "acescg"), rtol=0.01, atol=0.005)
+
+
+def test_masks_in_png_and_rec709(everything, tmp_path, monkeypatch):
+    path = Path(staged.write_truth(tmp_path, everything))
+    facts = json.loads(path.read_text())
+    mask = np.zeros((staged.HEIGHT, staged.WIDTH, 3), np.uint8)
+    mask[:10, :, 0], mask[10:20, :, 1] = 255, 51
+    formats.write_png(tmp_path / "mask.png", mask)
+    more = {"coverage": "mask.png", "coverage_names": ["one", "two"], "albedo_seen": "mask.png", "root": "$STAGED"}
+    path.write_text(json.dumps({**facts, **more}))
+    monkeypatch.setenv("STAGED", str(tmp_path))
+    truth = load_truth(path)
+    assert list(truth.coverage) == ["one", "two"]
+    assert truth.coverage["two"][15, 0] == pytest.approx(0.2)
+    assert truth.albedo[..., 3].mean() == pytest.approx(10 / staged.HEIGHT)
 
 
 @pytest.mark.parametrize("text", ["{", "{}", '{"plate": "p", "with_objects": "w", "coverage": "c", "space": "srgb"}'])
