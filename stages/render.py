@@ -1,12 +1,14 @@
 """What the objects are and what they change: object layer, lost and gained light, where it matters.
 
-A pilot at one eighth of the size says which blocks change by more than ``threshold`` of LS_noobj; only those are traced.
-``strategy = "difference"`` estimates the change itself; ``"reference"`` traces two full images with the same random
-numbers. Pixels that objects cover get more samples. Limits: one plane as local scene, distant light.
+A pilot on cells of eight pixels says what changes by more than ``threshold`` of LS_noobj, and where that change is
+smooth enough to be interpolated; only the rest is traced pixel by pixel. ``strategy = "difference"`` estimates the change
+itself; ``"reference"`` traces two full images with the same random numbers, every pixel. Pixels that objects cover get
+more samples. Limits: one plane as local scene, distant light.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +16,24 @@ import numpy as np
 
 from pipeline.camera.lens import ray_grid
 from pipeline.conventions import ACESCG
+from pipeline.image.colour import Space
 from pipeline.light.environment import irradiance
+from pipeline.light.sampling import bilinear, planes
 from pipeline.run import artifacts as A
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, load_meshes
-from pipeline.transport.scene import build_worlds, material_bsdf, mesh_shape
-from pipeline.transport.trace import Rays, Samples, reference_block, trace
+from pipeline.transport.region import CELL, Region, cell_pixels, plan
+from pipeline.transport.scene import Worlds, build_worlds, material_bsdf, mesh_shape
+from pipeline.transport.trace import Rays, Samples, Strategy, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Raster, Result, View
 from stages import knobs
 
-BLOCK = 8  # px, side of a pilot cell
-PILOT_SAMPLES = 64
-FEATHER = 2 * BLOCK  # px over which the change fades out at the border of the region
-STRATEGIES = {"difference": difference_block, "reference": reference_block}
+STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
+LOOKUP_ROW = 1024  # the lookup takes pictures, whose sides are limited, not long lists
+PILOT_SHARE = 4  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
 OBJECT_BOOST = 4  # more samples where an object is seen
 
 
@@ -53,7 +57,8 @@ def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any],
         meshes, notes = load_meshes(Path(wish["path"]))
         warnings += notes
         for index, mesh in enumerate(meshes):
-            material, space = mesh.material, "linear_rec709"
+            material: Material = mesh.material
+            space: Space = "linear_rec709"
             if wish["material"]:
                 given = dict(wish["material"])
                 space = given.pop("space")
@@ -64,37 +69,50 @@ def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any],
     return shapes, warnings
 
 
-def influence(
-    worlds: Any, camera_rays: Rays, shape: tuple[int, int], light: np.ndarray, params: knobs.Render
-) -> np.ndarray:
-    """(H, W) weight in [0, 1]: 0 where the objects change less than the threshold, feathered towards that border."""
-    from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
+def find_region(worlds: Worlds, rays: Rays, shape: tuple[int, int], light: np.ndarray, params: knobs.Render) -> Region:
+    """What to leave, interpolate and trace; the reference strategy interpolates nothing."""
+    index, grid = cell_pixels(*shape)
+    samples = max(64, PILOT_SHARE * params.samples)
+    pilot = trace(difference_block, worlds, rays[index], samples, params.depth, params.seed + 1, CELL)
+    region = plan(pilot, grid, shape, light, params.threshold)
+    return replace(region, traced=region.weight > 0) if params.strategy == "reference" else region
 
-    height, width = shape
-    rows = np.minimum(np.arange(BLOCK // 2, height + BLOCK // 2, BLOCK), height - 1)
-    columns = np.minimum(np.arange(BLOCK // 2, width + BLOCK // 2, BLOCK), width - 1)
-    index = (rows[:, None] * width + columns).ravel()
-    pilot = trace(
-        difference_block, worlds, camera_rays[index], PILOT_SAMPLES, min(params.depth, 4), params.seed + 1, BLOCK
+
+def plane_albedo(plane: Plane, albedo: Raster, rays: Rays) -> np.ndarray:
+    """(N, 3) albedo where the middle of each pixel meets the modelled rectangle; rays must meet it."""
+    along_u, along_v = plane.corners_m[1] - plane.corners_m[0], plane.corners_m[3] - plane.corners_m[0]
+    reach = (plane.offset_m - plane.normal @ rays.origin) / (rays.centre @ plane.normal)
+    offset = rays.origin + reach[:, None] * rays.centre - plane.corners_m[0]
+    height, width = albedo.shape
+    position = np.stack(
+        [offset @ along_u / (along_u @ along_u) * width, offset @ along_v / (along_v @ along_v) * height]
     )
-    grid = (len(rows), len(columns))
-    expected = pilot.albedo * light / np.pi
-
-    def smooth(values: np.ndarray) -> np.ndarray:
-        return gaussian_filter(values.reshape(*grid, 3), (1, 1, 0), mode="nearest")
-
-    change = np.linalg.norm(smooth(pilot.lost + pilot.gained), axis=-1)
-    level = np.linalg.norm(smooth(expected), axis=-1)
-    blocks = (change > params.threshold * level) & (level > 0) | (pilot.alpha.reshape(grid) > 0)
-    blocks = binary_dilation(blocks, np.ones((5, 5)))
-    mask = np.repeat(np.repeat(blocks, BLOCK, 0), BLOCK, 1)[:height, :width]
-    if mask.all():
-        return np.ones(shape)
-    weight = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1)
-    return weight * weight * (3 - 2 * weight)
+    folded = np.pad(position, ((0, 0), (0, -len(rays) % LOOKUP_ROW))).reshape(2, -1, LOOKUP_ROW)
+    return bilinear(planes(albedo.rgb()), *folded).reshape(-1, 3)[: len(rays)].astype(float)
 
 
-def trace_region(worlds: Any, rays: Rays, params: knobs.Render) -> Samples:
+def interpolated(region: Region, pixels: np.ndarray, albedo: np.ndarray, light: np.ndarray) -> Samples:
+    """The smooth part of the change as if it had been traced: relative change times LS_noobj of each pixel."""
+    model = albedo * light / np.pi
+    nothing, whole = np.zeros(len(pixels)), np.ones(len(pixels))
+
+    def at(field: np.ndarray) -> np.ndarray:
+        return field.reshape(-1, 3)[pixels]
+
+    return Samples(
+        obj=np.zeros_like(model),
+        alpha=nothing,
+        lost=at(region.lost) * model,
+        gained=at(region.gained) * model,
+        without=model,
+        albedo=albedo,
+        ground=whole,
+        obj_variance=np.zeros_like(model),
+        change_variance=at(region.variance) * model**2,
+    )
+
+
+def trace_region(worlds: Worlds, rays: Rays, params: knobs.Render) -> Samples:
     """The pixels of the region, then those that show an object again with more samples, merged by sample count."""
     strategy = STRATEGIES[params.strategy]
     first = trace(strategy, worlds, rays, params.samples, params.depth, params.seed + 2)
@@ -129,13 +147,18 @@ def compute(
     light = irradiance(radiance, plane.normal[None])[0]
     xn, dxn = ray_grid(camera)
     rays = Rays.of(views["plate"].world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
-    weight = influence(worlds, rays, shape, light, params)
-    pixels = np.flatnonzero(weight > 0)
-    if not len(pixels):
+    region = find_region(worlds, rays, shape, light, params)
+    traced, smooth = np.flatnonzero(region.traced), np.flatnonzero(region.interpolated)
+    if not len(traced) + len(smooth):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
-    samples = trace_region(worlds, rays[pixels], params)
+    parts = [interpolated(region, smooth, plane_albedo(plane, albedo, rays[smooth]), light)]
+    if len(traced):
+        parts.append(trace_region(worlds, rays[traced], params))
+    pixels = np.concatenate([smooth, traced])
+    samples, weight = Samples.joined(parts), region.weight
     layers = to_layers(samples, pixels, weight, shape, light)
     numbers = measure(samples, weight, layers, light, params)
+    numbers["traced_fraction"] = float(region.traced.mean())
     numbers["variant"] = mi.variant()
     if samples.not_finite:
         warnings.append(f"render: {samples.not_finite} samples were not finite and count as zero")
@@ -215,6 +238,12 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "modelled": f"{numbers['influenced_fraction']:.1%} of the frame",
             "because": f"a pilot found the rest to change by less than {params.threshold:.2%}",
             "could_cost": f"at most {params.threshold:.2%} of the plate outside the region",
+        },
+        {
+            "term": "every pixel of the region",
+            "modelled": f"{numbers['traced_fraction']:.1%} of the frame traced, the rest of the region interpolated",
+            "because": "second differences of the pilot bound the error of interpolation",
+            "could_cost": f"{params.threshold / 2:.2%} of the plate, and the pilot's noise",
         },
         {
             "term": "path depth",

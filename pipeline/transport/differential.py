@@ -6,8 +6,8 @@
 
 Every form is returned as the layers ``plate * mul + add + obj``. With D = LS_obj - LS_noobj
 estimated directly and N the *expected* LS_noobj (closed form on a plane), the ratio is 1 + D / N: linear in the noise,
-so unbiased, which a quotient of two noisy renders is not. All arrays are float, (H, W, 3) or (H, W), and carry coverage: a
-pixel half covered by an object has ``alpha`` 0.5 and D, N of its uncovered half.
+so unbiased, which a quotient of two noisy renders is not. All arrays are float, (H, W, 3) or (H, W), and carry
+coverage: a pixel half covered by an object has ``alpha`` 0.5 and D, N of its uncovered half.
 """
 
 from __future__ import annotations

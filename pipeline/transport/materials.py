@@ -5,7 +5,7 @@
     material   = mix(dielectric, metal, metallic)
 
 D is Trowbridge-Reitz with alpha = roughness^2, V the separable Smith term. Mitsuba's own ``principled`` is another
-model (a white furnace differs by 6 %). Both sides of a face are lit, as in offline renderers. ``alpha`` is at least 1e-3.
+model (a white furnace differs by 6 %). Both sides of a face are lit, as in offline renderers. ``alpha`` >= 1e-3.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Rays through the photographed lens, and the reference strategy: two full path-traced images.
 
 A camera sample that meets an object goes to the object layer (premultiplied); one that meets the local scene
-contributes to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and edges are
-exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The reference traces
+contributes to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and
+edges are exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The reference traces
 every sample in both worlds with the same random numbers; `pipeline.transport.difference` is the fast strategy.
 """
 
