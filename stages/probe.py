@@ -67,14 +67,18 @@ def compute(
     for name in names:
         maps[name], share = view_map(photographs[name], camera, views[name], found[name], radius, reflectance, params)
         clipped = np.maximum(clipped, share)
-    shade_photographers(maps, found, views, tripod, len(names))
+    shade_photographers(maps, found, views, tripod)
     numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) for name in names}
     numbers["views"], applied = level_views(maps, names, warnings)
     rgb, variance, seen = combine.merge(list(maps.values()))
     lamp = clipped_numbers(rgb, np.asarray(clipped), seen, warnings)
     rgb = combine.fill(rgb, np.minimum(seen * 4, 1) * (seen > 0))
     variance = np.where(np.isfinite(variance) & (seen > 0)[..., None], variance, rgb**2)
-    numbers |= lamp | map_numbers(rgb, seen)
+    rgb, variance, seen, laid = combine.lay_plate(
+        rgb, variance, seen, lookup_channels(photographs["plate"], (slice(None), slice(None)))[..., :7], camera,
+        views["plate"].world_from_camera, np.mean([ball.centre_world for ball in found.values()], 0),
+    )  # fmt: skip
+    numbers |= lamp | map_numbers(rgb, seen) | {"plane_from_plate_fraction": laid}
     environment = Raster(
         {**Raster.split(np.float32(rgb)), **Raster.split(np.float32(variance), "variance"), "seen": np.float32(seen)},
         ACESCG,
@@ -304,18 +308,22 @@ def angular_sigma(
 
 
 def shade_photographers(
-    maps: dict[str, combine.ViewMap], found: dict[str, Found], views: dict[str, View], tripod: set[str], count: int
+    maps: dict[str, combine.ViewMap], found: dict[str, Found], views: dict[str, View], tripod: set[str]
 ) -> None:
-    """Lower the weight of views where their own moved camera and photographer stand; the tripod's really stood there."""
-    if count < 2:
-        return
+    """Lower the weight of moved views where their own camera and photographer stand, and where the tripod's stood.
+
+    The tripod's photographer was there for the plate and lights it: only the tripod's views show him.
+    """
+    hidden = {}
     for name, view in maps.items():
-        if name in tripod:
-            continue
         to_camera = views[name].world_from_camera[:3, 3] - found[name].centre_world
         distance = float(np.linalg.norm(to_camera))
-        hidden = combine.toward_photographer(view.weight.shape[0], view.weight.shape[1], to_camera / distance, distance)
-        lowered = view.weight * (1 - (1 - combine.MOVED_PHOTOGRAPHER_WEIGHT) * hidden)
+        height, width = view.weight.shape
+        hidden[name] = combine.toward_photographer(height, width, to_camera / distance, distance)
+    for name in set(maps) - tripod if len(maps) > 1 else ():
+        view = maps[name]
+        shade = np.max([hidden[other] for other in {name} | (tripod & set(maps))], 0)
+        lowered = view.weight * (1 - (1 - combine.MOVED_PHOTOGRAPHER_WEIGHT) * shade)
         maps[name] = combine.ViewMap(view.rgb, view.variance, lowered, view.coverage)
 
 
@@ -395,19 +403,49 @@ def reasons(found: dict[str, Found], applied: list[str], tripod: set[str]) -> li
     height = 1e3 * max(ball.height.sigma_m for ball in found.values())
     rim = 1e3 * max(float(np.sqrt(b.height.normal @ b.free.covariance @ b.height.normal)) for b in found.values())
     return [
-        {"term": "ball stands on the plane", "modelled": True, "could_cost": "distance of the ball from its rim alone: about 1 px of radius",
-         "because": f"pose and contact give the height to {height:.1f} mm, the rim alone {rim:.1f} mm"},
-        {"term": "relative exposure of views", "modelled": bool(applied), "could_cost": "a seam of that ratio",
-         "because": f"differs by more than {combine.SIGNIFICANT:.0f} sigma in {', '.join(applied) or 'no view'}"},
-        {"term": "photographer removed", "modelled": len(found) > 1 and bool(moved), "could_cost": "one person's solid angle of wrong light",
-         "because": "moved views show a photographer who was not there for the plate; the tripod's own was and stays"},
-        {"term": "Fresnel reflectance of the ball", "modelled": False, "could_cost": "1 to 3 % near the rim of chrome, 0 of ideal mirrors",
-         "because": "the manifest gives one reflectance per channel"},
-        {"term": "parallax of near surfaces", "modelled": False, "could_cost": "directions off by R / distance, radiance unbiased",
-         "because": "the room's distances are not measured"},
-        {"term": "photon noise in the view weights", "modelled": False, "could_cost": "less than the bias it would bring to lamps",
-         "because": "photon variance follows the signal; views are weighted by how well they know the direction"},
-    ]  # fmt: skip
+        {
+            "term": "ball stands on the plane",
+            "modelled": True,
+            "because": f"pose and contact give the height to {height:.1f} mm, the rim alone to {rim:.1f} mm",
+            "could_cost": "the distance from the rim alone: about 1 px of radius",
+        },
+        {
+            "term": "relative exposure of views",
+            "modelled": bool(applied),
+            "because": f"differs by more than {combine.SIGNIFICANT:.0f} sigma in {', '.join(applied) or 'no view'}",
+            "could_cost": "a seam of that ratio",
+        },
+        {
+            "term": "moved photographer removed, the tripod's kept",
+            "modelled": len(found) > 1 and bool(moved),
+            "because": "who moved was not there for the plate; who stood at the tripod was, and lights it",
+            "could_cost": "one person's solid angle of wrong light",
+        },
+        {
+            "term": "plane from the plate below 7 degrees under the horizon",
+            "modelled": True,
+            "because": "the ball mirrors its own shadow; the plate shows the plane without it, taken as diffuse",
+            "could_cost": "up to 14 % of the irradiance from below, 5 % of that from the sides (measured on two captures)",
+        },
+        {
+            "term": "Fresnel reflectance of the ball",
+            "modelled": False,
+            "because": "the manifest gives one reflectance per channel",
+            "could_cost": "1 to 3 % near the rim of chrome, 0 of an ideal mirror",
+        },
+        {
+            "term": "parallax of near surfaces",
+            "modelled": False,
+            "because": "the room's distances are not measured",
+            "could_cost": "directions off by R over distance, radiance unbiased",
+        },
+        {
+            "term": "photon noise in the view weights",
+            "modelled": False,
+            "because": "it follows the signal; views are weighted by how well they know the direction",
+            "could_cost": "less than the bias it would bring to lamps",
+        },
+    ]
 
 
 STAGE = Stage(

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.conventions import latlong_directions, latlong_solid_angles
+from pipeline.camera.lens import project
+from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light.environment import resize_environment
+from pipeline.light.sampling import bilinear, planes
+from pipeline.types import Camera
 
 MOVED_PHOTOGRAPHER_WEIGHT = 1e-3  # another view wins wherever it sees; alone, the view still answers
-BODY_RADIUS_M, COLUMN_AZIMUTH, COLUMN_ABOVE = 0.12, np.radians(12.0), np.radians(8.0)
+BODY_RADIUS_M, COLUMN_AZIMUTH, COLUMN_ABOVE, COLUMN_FOOT = 0.12, np.radians(16.0), np.radians(10.0), np.radians(-12.0)
 TEXTURE_SCALE = 0.02  # rad: finer displacements than this cost nothing; sets how steep the weights are
 CELL_ROWS = 16  # rows of the coarse grid on which views are compared: cells of 11 degrees
 SIGNIFICANT = 3.0  # standard deviations
@@ -33,8 +36,8 @@ class ViewMap:
 def toward_photographer(height: int, width: int, to_camera: np.ndarray, distance: float) -> np.ndarray:
     """Softness (H, W) in [0, 1]: 1 where camera or photographer hide the room, given the direction (3,) to the camera.
 
-    The camera is a disc of 0.12 m; the photographer a column 12 degrees to either side, from 8 degrees above the camera
-    downwards. Edges fade over 2 degrees.
+    The camera is a disc of 0.12 m; the photographer a column 16 degrees to either side, from 10 degrees above the camera
+    down to 12 degrees below the horizon, where the table hides the rest. Edges fade over 2 degrees.
     """
     w = latlong_directions(height, width)
     fade = np.radians(2.0)
@@ -44,7 +47,7 @@ def toward_photographer(height: int, width: int, to_camera: np.ndarray, distance
     azimuth = np.abs(np.mod(azimuth + np.pi, 2 * np.pi) - np.pi)
     elevation = np.arcsin(np.clip(w[..., 1], -1, 1))
     top = np.arcsin(np.clip(to_camera[1], -1, 1)) + COLUMN_ABOVE
-    column = _ramp(COLUMN_AZIMUTH - azimuth, fade) * _ramp(top - elevation, fade)
+    column = _ramp(COLUMN_AZIMUTH - azimuth, fade) * _ramp(top - elevation, fade) * _ramp(elevation - COLUMN_FOOT, fade)
     return np.maximum(disc, column)
 
 
@@ -108,8 +111,8 @@ def merge(views: list[ViewMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def fill(rgb: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Radiance (H, W, 3) with unknown texels taken from ever wider solid-angle means of known neighbours.
 
-    ``known`` (H, W) in [0, 1]. A pyramid: each level halves the map, gaps take the interpolated coarser level (Gortler et
-    al., The Lumigraph, 1996, push-pull). Positive input gives positive output.
+    ``known`` (H, W) in [0, 1]. A pyramid: each level halves the map, gaps take the interpolated coarser level (push-pull,
+    Gortler et al., The Lumigraph, 1996). Positive input gives positive output.
     """
     height, width = known.shape
     if height <= 2 or width <= 4 or known.min() >= 1:
@@ -131,6 +134,33 @@ def _enlarge(rgb: np.ndarray, height: int, width: int) -> np.ndarray:
     below = np.minimum(top + 1, rgb.shape[0] - 1)
     tall = rgb[top] * (1 - down) + rgb[below] * down
     return tall[:, left % rgb.shape[1]] * (1 - right) + tall[:, (left + 1) % rgb.shape[1]] * right
+
+
+def lay_plate(
+    rgb: np.ndarray, variance: np.ndarray, seen: np.ndarray, plate: np.ndarray, camera: Camera,
+    world_from_camera: np.ndarray, centre: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
+    """Directions that meet the plane y = 0 near the ball show the plate's pixel there, not the ball's reflection.
+
+    The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same diffuse
+    plane without the ball. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees below the horizon, in full from
+    11: within 8 radii of the foot. Returns radiance, variance, seen and the fraction of the sphere that was laid.
+    """
+    height, width = seen.shape
+    w = latlong_directions(height, width)
+    down = np.minimum(w[..., 1], -1e-6)
+    foot = centre - w * (centre[1] / down)[..., None]
+    px = project(camera, transform_points(invert_rigid(world_from_camera), foot).reshape(-1, 3)).reshape(
+        height, width, 2
+    )
+    size = np.array([camera.width, camera.height])
+    inside = ((px > 1) & (px < size - 1)).all(-1)
+    found = bilinear(planes(plate), np.where(inside, px[..., 0], 0), np.where(inside, px[..., 1], 0))
+    share = _ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
+    mixed = [share[..., None] * found[..., i : i + 3] for i in (0, 3)]
+    rest = 1 - share[..., None]
+    laid = float((share * latlong_solid_angles(height, width)).sum() / (4 * np.pi))
+    return mixed[0] + rest * rgb, share[..., None] * mixed[1] + rest**2 * variance, np.maximum(seen, share), laid
 
 
 def gradient_per_radian(rgb: np.ndarray) -> np.ndarray:

@@ -1,0 +1,354 @@
+"""The mirror ball against an independent forward ray tracer: geometry, energy, fit, stage, extremes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from mirror_scene import Lamp, Place, look_at, photograph, sky
+
+from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
+from pipeline.light import mirror_ball, sphere_fit
+from pipeline.light.combine import ViewMap, fill, merge, relative_exposure, toward_photographer
+from pipeline.light.environment import AXES, downsample, irradiance, resize_environment, total_energy
+from pipeline.run.errors import CaptureError
+from pipeline.types import Camera, Raster, View
+from stages import knobs, probe
+
+RADIUS = 0.04
+LAMPS = [Lamp((0.3, 0.8, 0.4), 0.06, 200.0), Lamp((-0.6, 0.3, -0.5), 0.1, 30.0)]
+
+
+def camera_of(radius_px: float, distance: float = 0.5, width: int = 420, height: int = 340) -> Camera:
+    focal = radius_px * distance / RADIUS
+    return Camera(
+        width=width, height=height, fx=focal, fy=focal * 1.001, cx=width / 2 - 5, cy=height / 2 + 7,
+        distortion=np.array([-0.08, 0.02, 5e-4, -3e-4, 0]),
+    )  # fmt: skip
+
+
+def raster(picture: np.ndarray, noise: float = 0.003) -> Raster:
+    variance = (noise * picture) ** 2
+    mask = np.zeros(picture.shape[:2], np.uint32)
+    return Raster(
+        {**Raster.split(np.float32(picture)), **Raster.split(np.float32(variance), "variance"), "mask": mask}, "acescg"
+    )
+
+
+def view(world_from_camera: np.ndarray) -> View:
+    covariance = np.diag([2e-4**2] * 3 + [2e-4**2] * 3)
+    return View(world_from_camera=world_from_camera, covariance=covariance, route="given", rms_px=0.1, points=20)
+
+
+def facts(*balls: tuple[str, bool]) -> dict[str, Any]:
+    return {
+        "ball": [{"name": name, "tripod": tripod} for name, tripod in balls],
+        "probe": {"diameter_m": 2 * RADIUS, "reflectance": (0.8, 0.8, 0.8), "reflectance_space": "acescg"},
+    }
+
+
+def truth_map(place: Place, height: int, width: int, split: int = 4) -> np.ndarray:
+    w = latlong_directions(height * split, width * split).reshape(-1, 3)
+    rgb = place.radiance(np.broadcast_to(place.ball, w.shape), w).reshape(height * split, width * split, 3)
+    return downsample(rgb, split)
+
+
+# ---- geometry ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ratio", [1e-6, 0.05, 0.3, 0.9])
+def test_incidence_inverts_deviation(ratio):
+    sine = np.linspace(0, 1, 500)
+    again = np.sin(mirror_ball.incidence(mirror_ball.deviation(sine, ratio), ratio))
+    assert again == pytest.approx(sine, abs=1e-9)
+
+
+def test_far_away_is_debevecs_formula_and_blind_cone_is_the_limit():
+    sine = np.linspace(0, 1, 100)
+    assert mirror_ball.deviation(sine, 1e-9) == pytest.approx(2 * np.arcsin(sine), abs=1e-8)
+    assert np.pi - mirror_ball.deviation(1.0, 0.3) == pytest.approx(mirror_ball.blind_half_angle(0.3), abs=1e-12)
+
+
+def test_reflected_rays_come_back():
+    w = np.random.default_rng(0).normal(size=(2000, 3))
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    centre = np.array([0.05, 0.1, 0.3])
+    distance = np.linalg.norm(centre)
+    rays, sine = mirror_ball.rays_from_directions(w, -centre / distance, RADIUS / distance)
+    seen = ~np.isnan(sine)
+    blind = w @ (centre / distance) > np.cos(mirror_ball.blind_half_angle(RADIUS / distance))
+    assert (seen == ~blind).all()
+    assert mirror_ball.directions_from_rays(rays[seen], centre, RADIUS) == pytest.approx(w[seen], abs=1e-9)
+
+
+def test_radians_per_pixel_is_the_derivative():
+    ratio, step = 0.2, 1e-6
+    sine = np.array([0.0, 0.3, 0.9])
+    radial, _ = mirror_ball.radians_per_pixel(sine, ratio, 100)
+    numeric = (mirror_ball.deviation(sine + step, ratio) - mirror_ball.deviation(sine, ratio)) / (100 * step)
+    assert radial == pytest.approx(numeric, rel=1e-4)
+
+
+# ---- unwrap with the true centre -----------------------------------------------------------------------------------
+
+
+def unwrapped(place: Place, camera: Camera, pose: np.ndarray, height: int = 64, split: int = 4, count: int = 3):
+    picture = photograph(place, camera, pose, split)
+    centre = transform_points(invert_rigid(pose), np.array(place.ball))
+    size = sphere_fit.radius_in_pixels(camera, centre, RADIUS)
+    count = mirror_ball.samples_per_axis(2 * height, size, count)
+    return mirror_ball.unwrap(picture, camera, pose, centre, RADIUS, height, 2 * height, count, 0.97)
+
+
+@pytest.mark.parametrize("name", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_six_directions(name):
+    axis = dict(zip(("+x", "-x", "+y", "-y", "+z", "-z"), AXES, strict=True))[name]
+    place = Place(sky([Lamp(tuple(axis + (0.02, 0.03, 0.01)), 0.12, 500.0)], 0.0))
+    camera, pose = camera_of(60, width=160, height=160), look_at((0.25, 0.35, 0.3), (0, RADIUS, 0))
+    found = unwrapped(place, camera, pose, 32, 2)
+    row, column = np.unravel_index(found.values[..., 1].argmax(), found.coverage.shape)
+    brightest = direction_from_latlong((column + 0.5) / 64, (row + 0.5) / 32)
+    assert np.degrees(np.arccos(brightest @ axis)) < 12  # within the lamp and a texel
+
+
+def test_constant_light_gives_a_constant_map():
+    place = Place(sky([], 0.0), reflectance=0.8)
+    found = unwrapped(place, camera_of(50, width=140, height=140), look_at((0.25, 0.35, 0.3), (0, RADIUS, 0)), 32, 2)
+    inner = found.coverage > 0
+    assert found.values[inner] == pytest.approx(0.8, rel=2e-5)  # float32
+    blind = 1 - inner.mean()
+    assert 0 < blind < 0.1
+
+
+@pytest.mark.parametrize(
+    ("position", "radius_px"), [((0.25, 0.35, 0.3), 40.0), ((0.25, 0.35, 0.3), 120.0), ((-0.3, 0.3, 0.35), 60.0)]
+)
+def test_lamp_energy_is_conserved(position, radius_px):
+    # 3 %: a lamp of 7 degrees on 40 px; its edge pixels are cut by the 4 x 4 ray grid of the truth (measured 0.3 to 1 %)
+    lamp = Lamp((0.2, 0.9, 0.3), 0.06, 1000.0)
+    place = Place(sky([lamp], 0.0), reflectance=1.0)
+    camera = camera_of(radius_px, width=int(2.6 * radius_px), height=int(2.6 * radius_px))
+    camera = camera.model_copy(update={"cx": camera.width / 2, "cy": camera.height / 2})
+    found = unwrapped(place, camera, look_at(position, (0, RADIUS, 0)))
+    w = latlong_directions(64, 128)
+    near = w @ (np.array(lamp.direction) / np.linalg.norm(lamp.direction)) > np.cos(0.2)
+    energy = total_energy((found.values - 1) * near[..., None])[0]
+    assert energy == pytest.approx(2 * np.pi * (1 - np.cos(0.06)) * 999, rel=0.03)
+
+
+def test_sun_on_the_seam_is_whole():
+    lamp = Lamp((0.0, 0.25, -1.0), 0.08, 1000.0)
+    place = Place(sky([lamp], 0.0), reflectance=1.0)
+    found = unwrapped(place, camera_of(60, width=160, height=160), look_at((0.4, 0.3, 0.0), (0, RADIUS, 0)))
+    energy = total_energy(found.values - (found.coverage > 0)[..., None])[0]
+    assert energy == pytest.approx(2 * np.pi * (1 - np.cos(0.08)) * 999, rel=0.03)  # as above
+
+
+# ---- fit -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shots() -> dict[str, Any]:
+    """A plate and two ball views of a ball of about 100 px by a chequered board, 0.3 % noise."""
+    place = Place(sky(LAMPS), plane=True, ball=(0.02, RADIUS, 0.01))
+    a, b = look_at((0.08, 0.27, 0.40), (0.03, 0.03, 0)), look_at((0.45, 0.30, 0.05), (0.03, 0.03, 0))
+    camera = camera_of(100)
+    empty = dataclasses.replace(place, ball=None)
+    return {
+        "place": place, "camera": camera, "views": {"plate": view(a), "ball_a": view(a), "ball_b": view(b)},
+        "photographs": {
+            "plate": raster(photograph(empty, camera, a, 3, 0.003, 1)),
+            "ball_a": raster(photograph(place, camera, a, 3, 0.003, 2)),
+            "ball_b": raster(photograph(place, camera, b, 3, 0.003, 3)),
+            "bare_b": raster(photograph(empty, camera, b, 3, 0.003, 4)),
+        },
+    }  # fmt: skip
+
+
+def run(shots: dict[str, Any], *balls: tuple[str, bool], width: int = 256):
+    used = ["plate", *(name for name, _ in balls)]
+    photographs = {name: shots["photographs"][name] for name in used}
+    return probe.compute(
+        facts(*balls), photographs, shots["camera"], shots["views"], knobs.Probe(width=width, supersample=2)
+    )
+
+
+@pytest.fixture(scope="module")
+def result(shots):
+    return run(shots, ("ball_a", True), ("ball_b", False))
+
+
+def direction_rms_deg(fitted: np.ndarray, true: np.ndarray) -> float:
+    """Error of reflected directions over the disc r < 0.9, weighted by picture area."""
+    rng = np.random.default_rng(0)
+    r, angle = 0.9 * np.sqrt(rng.random(4000)), 2 * np.pi * rng.random(4000)
+    axis = true / np.linalg.norm(true)
+    first = np.cross(axis, (0, 1, 0)) / np.linalg.norm(np.cross(axis, (0, 1, 0)))
+    second = np.cross(axis, first)
+    sine = r * RADIUS / np.linalg.norm(true)
+    rays = np.sqrt(1 - sine**2)[:, None] * axis + sine[:, None] * (
+        np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    )
+    two = [mirror_ball.directions_from_rays(rays, centre, RADIUS) for centre in (fitted, true)]
+    error = np.arccos(np.clip((two[0] * two[1]).sum(1), -1, 1))
+    return float(np.degrees(np.sqrt(np.mean(error**2))))
+
+
+@pytest.mark.parametrize("name", ["ball_a", "ball_b"])
+def test_directions_of_the_fit(shots, result, name):
+    ball = result.outputs["balls"][name]
+    true = transform_points(invert_rigid(shots["views"][name].world_from_camera), np.array(shots["place"].ball))
+    assert ball.radius_px > 80
+    assert direction_rms_deg(ball.centre_camera_m, true) < 0.3 * 100 / ball.radius_px  # the mission's figure at 100 px
+    assert abs(result.numbers[name]["height_discrepancy_mm"]) < 4 * result.numbers[name]["height_discrepancy_sigma_mm"]
+
+
+def test_map_and_irradiance_against_truth(shots, result):
+    environment = result.outputs["environment"]
+    truth = truth_map(shots["place"], 128, 256)
+    found, expected = irradiance(environment.rgb(), AXES), irradiance(truth, AXES)
+    error = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    # The plane lies within a few radii, so directions near the horizon are displaced by parallax (measured 0.9 %).
+    assert error.max() < 0.02
+    assert error[2] < 0.01  # upwards, the light of things that lie on the plane
+    assert result.numbers["views"]["ball_b"]["exposure_ratio"] == pytest.approx(1, abs=0.01)
+    assert result.numbers["seen_fraction"] > 0.99
+
+
+def test_exposure_doubles_the_map_and_keeps_the_fit(shots, result):
+    bright = {
+        name: Raster({k: v * (2 if "mask" not in k else 1) * (2 if "var" in k else 1) for k, v in r.channels.items()}, r.space)
+        for name, r in shots["photographs"].items()
+    }
+    doubled = run({**shots, "photographs": bright}, ("ball_a", True), ("ball_b", False))
+    assert doubled.outputs["environment"].rgb() == pytest.approx(2 * result.outputs["environment"].rgb(), rel=1e-4)
+
+
+def test_view_twice_as_bright_is_levelled(shots, result):
+    photographs = dict(shots["photographs"])
+    photographs["ball_b"] = Raster(
+        {k: (v if k == "mask" else v * 2 ** (2 if "var" in k else 1)) for k, v in photographs["ball_b"].channels.items()},
+        "acescg",
+    )
+    found = run({**shots, "photographs": photographs}, ("ball_a", True), ("ball_b", False))
+    assert found.numbers["views"]["ball_b"]["exposure_ratio"] == pytest.approx(2, rel=0.02)
+    assert any("brought to it" in warning for warning in found.warnings)
+    error = irradiance(found.outputs["environment"].rgb(), AXES) / irradiance(result.outputs["environment"].rgb(), AXES)
+    assert error == pytest.approx(1, abs=0.01)
+
+
+def test_one_view_marks_what_it_does_not_see(shots):
+    found = run(shots, ("ball_a", True))
+    environment = found.outputs["environment"]
+    assert 0.8 < found.numbers["seen_fraction"] < 0.999
+    assert np.isfinite(environment.rgb()).all()
+    hidden = environment["seen"] == 0
+    assert hidden.any()
+    relative = environment.rgb("variance")[hidden] / environment.rgb()[hidden] ** 2
+    assert relative.min() > 0.9  # unseen light is known to 100 %
+
+
+def test_clipped_lamp_is_a_lower_bound(shots):
+    photographs = dict(shots["photographs"])
+    for name in ("ball_a", "ball_b"):
+        old = photographs[name]
+        over = old["G"] > 20
+        channels = {k: (np.where(over, 20, v) if k in "RGB" else v) for k, v in old.channels.items()}
+        for c in "RGB":
+            channels[f"variance.{c}"] = np.where(over, np.inf, old[f"variance.{c}"]).astype(np.float32)
+        channels["mask"] = np.where(over, CLIPPED, old["mask"]).astype(np.uint32)
+        photographs[name] = Raster(channels, "acescg")
+    found = run({**shots, "photographs": photographs}, ("ball_a", True), ("ball_b", False))
+    assert found.numbers["clipped_texels"] > 0
+    assert any("lower bound" in warning for warning in found.warnings)
+    assert np.isfinite(found.outputs["environment"].rgb("variance")).all()
+
+
+# ---- refused and flagged -------------------------------------------------------------------------------------------
+
+
+def test_no_ball_is_refused(shots):
+    shots = {**shots, "photographs": {**shots["photographs"], "ball_b": shots["photographs"]["bare_b"]}}
+    with pytest.raises(CaptureError, match="ball_b: no mirror ball"):
+        run(shots, ("ball_b", False))
+
+
+def test_tripod_view_without_ball_is_refused(shots):
+    shots = {**shots, "photographs": {**shots["photographs"], "ball_a": shots["photographs"]["plate"]}}
+    with pytest.raises(CaptureError, match="ball_a: no mirror ball"):
+        run(shots, ("ball_a", True))
+
+
+@pytest.mark.parametrize(
+    ("radius_px", "target"), [(35.0, (0.02, 0.03, 0.01)), (60.0, (-0.14, 0.03, 0.01)), (60.0, (0.02, 0.14, 0.01))]
+)
+def test_small_off_axis_and_near_the_edge(radius_px, target):
+    place = Place(sky(LAMPS), plane=True, ball=(0.02, RADIUS, 0.01))
+    pose = look_at((0.08, 0.27, 0.40), target)
+    camera = camera_of(radius_px, width=400, height=360)
+    shots = {
+        "camera": camera, "views": {"plate": view(pose), "ball_a": view(pose)},
+        "photographs": {
+            "plate": raster(photograph(dataclasses.replace(place, ball=None), camera, pose, 3, 0.003, 1)),
+            "ball_a": raster(photograph(place, camera, pose, 3, 0.003, 2)),
+        },
+    }  # fmt: skip
+    found = run(shots, ("ball_a", True))
+    ball = found.outputs["balls"]["ball_a"]
+    true = transform_points(invert_rigid(pose), np.array(place.ball))
+    assert direction_rms_deg(ball.centre_camera_m, true) < 40 / ball.radius_px  # 0.3 degrees at 100 px, with a margin
+    assert any("coarse" in warning for warning in found.warnings) == (ball.radius_px < 40)
+
+
+def test_ball_thirty_degrees_off_axis():
+    place = Place(sky(LAMPS, 0.3), reflectance=0.8)
+    pose = look_at((0.25, 0.35, 0.3), (0, RADIUS, 0))
+    turn = np.radians(30)
+    pose[:3, :3] = pose[:3, :3] @ np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    camera = camera_of(60, width=780, height=160).model_copy(update={"distortion": np.zeros(5)})
+    found = unwrapped(place, camera, pose, 32, 2)
+    truth = 0.8 * truth_map(place, 32, 64)
+    smooth = (found.coverage > 0.999) & (truth.max(-1) < 2)
+    inner = smooth & (found.sine < 0.9)
+    assert np.median(np.abs(found.values[inner] / truth[inner] - 1)) < 0.005
+
+
+# ---- combination ---------------------------------------------------------------------------------------------------
+
+
+def test_photographer_is_where_the_camera_is():
+    toward = np.array([0.6, 0.5, -0.6])
+    toward /= np.linalg.norm(toward)
+    hidden = toward_photographer(64, 128, toward, 0.7)
+    w = latlong_directions(64, 128)
+    assert hidden[np.unravel_index((w @ toward).argmax(), hidden.shape)] == 1
+    assert hidden[np.unravel_index((w @ -toward).argmax(), hidden.shape)] == 0
+
+
+def test_fill_keeps_constants_and_known_texels():
+    known = np.ones((32, 64))
+    known[10:20, 50:64] = 0
+    rgb = np.where(known[..., None] > 0, 3.0, 99.0) * np.ones(3)
+    assert fill(rgb, known) == pytest.approx(3.0)
+
+
+def test_merge_of_equal_views_halves_the_variance():
+    one = np.ones((8, 16))
+    map_of = ViewMap(np.full((8, 16, 3), 2.0), np.full((8, 16, 3), 0.1), one, one)
+    rgb, variance, seen = merge([map_of, map_of])
+    assert rgb == pytest.approx(2)
+    assert variance == pytest.approx(0.05)
+    assert seen == pytest.approx(1)
+
+
+def test_relative_exposure_sees_through_a_moved_lamp():
+    rng = np.random.default_rng(2)
+    base = resize_environment(rng.gamma(4, 0.25, (16, 32, 3)), 64, 128)
+    other = 1.1 * base * (1 + 0.01 * rng.normal(size=base.shape))
+    other[10:14, 20:26] = 500
+    one = np.ones((64, 128))
+    ratio, sigma, _ = relative_exposure(ViewMap(base, base, one, one), ViewMap(other, other, one, one))
+    assert ratio == pytest.approx(1.1, rel=0.003)
+    assert sigma < 0.002
