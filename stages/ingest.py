@@ -25,6 +25,7 @@ from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, WISHES
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.manifest import CaptureFacts, SceneWishes, load_capture, load_toml, problems_of, resolve_files
 from pipeline.run.stage import Stage
+from pipeline.transport.meshes import refuse_undecodable
 from pipeline.types import Bracket, Frame, Result
 from stages import knobs
 
@@ -80,6 +81,10 @@ def _wishes(scene: Path | None, root: Path, problems: list[str]) -> dict[str, An
         elif found is None:
             problems.append(f"{where}: is {wish['file']!r}; no such file in {' or '.join(map(str, folders))}")
         else:
+            try:
+                refuse_undecodable(found)
+            except ManifestError as error:
+                problems.append(f"{where}: {error}")
             wish |= {"path": str(found.resolve()), "sha256": file_sha256(found)}
     return dumped
 

@@ -11,11 +11,14 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pipeline
 from pipeline.run import closure
 from pipeline.run.errors import InsituError, ManifestError
+
+if TYPE_CHECKING:
+    from pipeline.run.settings import Settings
 
 EPILOG = "Exit codes: 0 done, 2 manifest or switch, 3 photographs, 4 build files, 5 external tool, 6 no unique answer."
 
@@ -128,23 +131,45 @@ def out_of(args: argparse.Namespace) -> Path:
     return args.out or Path("build") / load_capture(args.capture)[0].name
 
 
+def resolved(args: argparse.Namespace) -> Settings:
+    """Settings of this run. Raises ManifestError with every problem that the texts alone tell."""
+    from pipeline.run.settings import resolve
+    from stages.knobs import KNOBS, PRESETS
+
+    switches = getattr(args, "set", [])
+    chosen = resolve(
+        args.capture, getattr(args, "scene", None), getattr(args, "quality", None), switches, KNOBS, PRESETS
+    )
+    wanted, known = chosen.params["composite"], KNOBS["composite"]().model_dump()
+    if os.environ.get("OCIO") or any(wanted[key] != known[key] for key in ("display", "view")):
+        import numpy as np
+
+        from pipeline.image.display import display_transform
+
+        display_transform(np.zeros((1, 1, 3)), wanted["display"], wanted["view"])  # now, not after the rendering
+    return chosen
+
+
 def with_build(args: argparse.Namespace) -> int:
     """Verbs that need a build folder."""
     from pipeline.run import settings as asked
-    from stages.knobs import KNOBS, PRESETS
+    from pipeline.run.manifest import load_capture
+    from stages.knobs import KNOBS
 
-    resolves = args.verb in ("run", "settings")
-    out = out_of(args)
-    if resolves or not (out / "settings.json").exists():
-        chosen = asked.resolve(
-            args.capture,
-            getattr(args, "scene", None),
-            getattr(args, "quality", None),
-            getattr(args, "set", []),
-            KNOBS,
-            PRESETS,
-        )
+    last = getattr(args, "upto", None) or stage_names()[-1]
+    if last not in stage_names():
+        raise ManifestError(f"--upto: is {last!r}; expected one of {', '.join(stage_names())}")
+    if args.verb in ("run", "settings"):
+        chosen = resolved(args)
+        out = out_of(args)
         asked.save(chosen, out)
+    else:
+        out = out_of(args)
+        if not (out / "settings.json").exists():
+            asked.save(resolved(args), out)
+        chosen = asked.load(out)
+        if Path(chosen.capture) != (file := load_capture(args.capture)[1].resolve()):
+            raise ManifestError(f"{out}: is a build of {chosen.capture}, not of {file}; give another --out")
     if args.verb == "settings":
         return 0
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
@@ -152,7 +177,7 @@ def with_build(args: argparse.Namespace) -> int:
     from pipeline.run.runner import Build
     from stages.order import graph
 
-    build = Build(graph(), out, asked.load(out), KNOBS)
+    build = Build(graph(), out, chosen, KNOBS)
     if args.verb == "summary":
         say(print_summary(build))
         return 0
@@ -160,15 +185,8 @@ def with_build(args: argparse.Namespace) -> int:
         problems = build.verify()
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
-    names = stage_names()
-    if args.verb == "run":
-        last = args.upto or names[-1]
-        if last not in names:
-            raise ManifestError(f"--upto: is {last!r}; expected one of {', '.join(names)}")
-        stages = build.graph.upto(last)
-    else:
-        stages = [build.graph[args.stage]]
+    stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
     build.run_all(stages, lambda name, outcome, seconds: say(f"{name:<12} {outcome:<6} {seconds:7.2f} s"))
-    if args.verb == "run" and last == names[-1]:
+    if args.verb == "run" and last == stage_names()[-1]:
         say(print_summary(build))
     return 0

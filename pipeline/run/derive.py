@@ -57,6 +57,10 @@ HEADLINES = {
 }
 
 
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
 def print_summary(build: Build) -> str:
     """Paths, errors beside doing nothing, and seconds per stage."""
     from pipeline.run.artifacts import COMPOSITE, DISPLAY, METRICS, REPORT
@@ -68,9 +72,12 @@ def print_summary(build: Build) -> str:
     metrics = build.value(METRICS) if build.record("evaluate") else {}
     if metrics:
         lines += ["", f"{'error against truth':<38} {'ours':>9} {'doing nothing':>14}"]
+        nothing = metrics.get("do_nothing", {})
         for key, text in HEADLINES.items():
-            lines.append(f"{text:<38} {metrics[key]:9.4f} {metrics['do_nothing'][key]:14.4f}")
-        lines.append(f"{'untouched pixels identical':<38} {metrics['untouched_identical']!s:>9}")
+            lines.append(f"{text:<38} {_figure(metrics.get(key)):>9} {_figure(nothing.get(key)):>14}")
+        lines.append(f"{'untouched pixels identical':<38} {metrics.get('untouched_identical')!s:>9}")
+    elif build.record("evaluate"):
+        lines += ["", "no truth is given: the report's self-check predicts what really stood there"]
     records = [(stage.name, build.record(stage.name)) for stage in build.graph.stages]
     done = [(name, record) for name, record in records if record]
     lines += ["", f"{'stage':<12} {'wall s':>8} {'CPU s':>8}"]

@@ -1,18 +1,21 @@
 """Read, compute, check, write, record: the one way from files to files.
 
 Make decides what to ask by time; this decides what to do by digest of inputs, parameters, code and library versions.
-``record.json`` is written last, so an interrupted stage leaves none and runs again.
+``record.json`` is removed before the first output is replaced and written last, so an interrupted stage leaves none and
+runs again. Two processes may work on one build: a stage is locked while it runs, its inputs while they are read.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import importlib.metadata
 import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,22 +41,29 @@ class Build:
     out: Path
     settings: Settings
     knobs: dict[str, Any]
-    memory: dict[str, Any] = field(default_factory=dict)
+    memory: dict[str, tuple[str, Any]] = field(default_factory=dict)  # artifact -> its digest and value
     versions: dict[str, str] = field(default_factory=lambda: {n: importlib.metadata.version(n) for n in LIBRARIES})
 
     def record(self, name: str) -> dict[str, Any] | None:
         """The record of a stage, or None when it has not run."""
         path = self.out / name / "record.json"
         try:
-            return json.loads(path.read_bytes())
-        except (FileNotFoundError, json.JSONDecodeError):
+            record = json.loads(path.read_bytes())
+        except (FileNotFoundError, ValueError):
             return None
+        produced = {artifact.name for artifact in self.graph[name].outputs.values()}
+        whole = isinstance(record, dict) and produced <= set(record.get("outputs") or {})
+        return record if whole else None
 
     def value(self, artifact: Artifact) -> Any:
-        """An input, from memory or from disk."""
-        if artifact.name not in self.memory:
-            self.memory[artifact.name] = formats.read(self.out / self.graph.producer[artifact.name].name, artifact)
-        return self.memory[artifact.name]
+        """An input, from memory when that is what its producer recorded last, else from disk."""
+        producer = self.graph.producer[artifact.name].name
+        digest = (self.record(producer) or {"outputs": {}})["outputs"].get(artifact.name, "")
+        known, value = self.memory.get(artifact.name, ("", None))
+        if not digest or known != digest:
+            value = formats.read(self.out / producer, artifact)
+            self.memory[artifact.name] = digest, value
+        return value
 
     def input_digests(self, stage: Stage) -> dict[str, str]:
         """Digest of every input as its producer recorded it. Raises ArtifactError when a producer has not run."""
@@ -77,8 +87,25 @@ class Build:
         records = {parent.name: self.record(parent.name) or {} for parent in self.graph.parents(stage)}
         return {name: {key: record.get(key) for key in keys} for name, record in records.items()}
 
+    @contextlib.contextmanager
+    def locked(self, stage: Stage) -> Iterator[None]:
+        """Keep other processes from running the stage, or from replacing its inputs, until the block ends.
+
+        Locks are taken in reading order, so that no two processes wait for each other.
+        """
+        with contextlib.ExitStack() as stack:
+            for other in [*self.graph.parents(stage), stage]:
+                (self.out / other.name).mkdir(parents=True, exist_ok=True)
+                file = stack.enter_context((self.out / other.name / ".lock").open("w"))
+                fcntl.flock(file, fcntl.LOCK_EX if other is stage else fcntl.LOCK_SH)
+            yield
+
     def run(self, stage: Stage) -> str:
-        """Run one stage unless its record shows that nothing changed; ``"fresh"`` or ``"ran"``."""
+        """Run one stage unless its record shows that nothing changed; ``"fresh"``, ``"ran"`` or ``"same"`` (bytes)."""
+        with self.locked(stage):
+            return self._run(stage)
+
+    def _run(self, stage: Stage) -> str:
         wanted = {
             "stage": stage.name,
             "inputs": self.input_digests(stage),
@@ -96,11 +123,12 @@ class Build:
             raise TypeError(
                 f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}"
             )
+        (self.out / stage.name / "record.json").unlink(missing_ok=True)
         outputs = {}
         for key, artifact in stage.outputs.items():
             value = settle(artifact, result.outputs[key])
-            self.memory[artifact.name] = value
             outputs[artifact.name] = formats.digest(formats.write(self.out / stage.name, artifact, value))
+            self.memory[artifact.name] = outputs[artifact.name], value
         seconds = {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
         measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
         changed = old is None or old.get("outputs") != outputs

@@ -44,6 +44,17 @@ class Mesh:
     material: Material
 
 
+def refuse_undecodable(path: Path) -> None:
+    """Raise ManifestError for what the head of an object file tells to be unreadable; reads no geometry."""
+    if path.suffix.lower() == ".glb":
+        _glb_materials(path)
+    elif path.suffix.lower() == ".ply":
+        with path.open("rb") as stream:
+            head = stream.read(3)
+        if head != b"ply":
+            raise ManifestError(f"{path}: starts with {head!r}; expected a PLY file ('ply')")
+
+
 def load_meshes(path: Path) -> tuple[list[Mesh], list[str]]:
     """Meshes of a file, node transforms applied, and what was left out (zero-area faces, unread material features).
 
@@ -82,7 +93,10 @@ def _glb_materials(path: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
         head = stream.read(20)
         if len(head) < 20 or head[:4] != GLB_MAGIC:
             raise ManifestError(f"{path}: starts with {head[:4]!r}; expected a binary glTF ('glTF')")
-        document = json.loads(stream.read(struct.unpack("<I", head[12:16])[0]))
+        try:
+            document = json.loads(stream.read(struct.unpack("<I", head[12:16])[0]))
+        except ValueError as error:
+            raise ManifestError(f"{path}: its glTF description is damaged ({error}); export it again") from error
     missing = set(document.get("extensionsRequired", [])) - SUPPORTED_EXTENSIONS
     if missing:
         raise ManifestError(f"{path}: needs {', '.join(sorted(missing))}, which is not decoded; export it without")
