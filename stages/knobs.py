@@ -44,7 +44,7 @@ class Pose(Params):
     """Pose of every view."""
 
     corner_sigma_px: float = Field(0.1, gt=0, description="standard uncertainty of a detected corner [px]")
-    min_ambiguity: float = Field(4.0, gt=1, description="refuse when the second planar solution is nearer than this chi2 ratio")
+    min_ambiguity: float = Field(4.0, gt=1, description="refuse when the second pose fits within this chi2 ratio")
 
 
 class Probe(Params):
@@ -72,19 +72,20 @@ class Render(Params):
     """With and without the objects."""
 
     strategy: Literal["difference", "reference"] = Field("difference", description="the change itself, or two renders")
-    samples: int = Field(64, ge=1, le=65536, description="samples per pixel")
+    samples: int = Field(48, ge=1, le=65536, description="samples per pixel")
     depth: int = Field(6, ge=2, le=64, description="longest path [vertices]")
-    threshold: float = Field(0.002, ge=0, le=0.05, description="change below this fraction is left to the plate")
+    threshold: float = Field(0.004, ge=0, le=0.05, description="change below this fraction is left to the plate")
+    denoise: bool = Field(True, description="denoise the object layer and the relative change")
     seed: int = Field(0, ge=0, description="seed of the sampler")
 
 
 class Composite(Params):
     """Putting it together."""
 
-    kind: Literal["additive", "ratio", "auto"] = Field("auto", description="equation 4, equation 5, or chosen per pixel")
+    kind: Literal["additive", "ratio", "auto"] = Field("auto", description="equation 4, 5, or chosen per pixel")
     view: str = Field("ACES 2.0 - SDR 100 nits (Rec.709)", description="OCIO view of the display picture")
     display: str = Field("sRGB - Display", description="OCIO display")
-    exposure_ev: float = Field(0.0, ge=-20, le=20, description="exposure of the display picture over the automatic one [EV]")
+    exposure_ev: float = Field(0.0, ge=-20, le=20, description="over automatic display exposure [EV]")
 
 
 class Evaluate(Params):
@@ -107,7 +108,7 @@ KNOBS: dict[str, type[Params]] = {
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "draft": {
         "merge": {"weights": "poisson"}, "develop": {"demosaic": "bilinear"}, "probe": {"width": 512, "supersample": 2},
-        "reflectance": {"texture_px": 512}, "render": {"samples": 8, "depth": 4},
+        "reflectance": {"texture_px": 512}, "render": {"samples": 8, "depth": 4, "threshold": 0.008},
     },
     "preview": {},
     "final": {

@@ -106,8 +106,9 @@ def judge(measured: np.ndarray, light: np.ndarray, albedo: np.ndarray) -> tuple[
     if above > 0.01:
         scale = float(np.quantile(measured, 0.99))
         warnings.append(
-            f"albedo: {above:.1%} of the seen texels exceed 1 (99 % quantile {scale:.2f}), needed <= 1; the probe is too "
-            f"dark by up to {scale:.2f} x: check the ball's reflectance, clipped lights, and exposure between plate and ball"
+            f"albedo: {above:.1%} of the seen texels exceed 1 (99 % quantile {scale:.2f}), needed <= 1; the probe is "
+            f"too dark by up to {scale:.2f} x: check the ball's reflectance, clipped lights, and exposure between "
+            "plate and ball"
         )
     return numbers, warnings
 

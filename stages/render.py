@@ -1,9 +1,9 @@
 """What the objects are and what they change: object layer, lost and gained light, where it matters.
 
 A pilot on cells of eight pixels says what changes by more than ``threshold`` of LS_noobj, and where that change is
-smooth enough to be interpolated; only the rest is traced pixel by pixel. ``strategy = "difference"`` estimates the change
-itself; ``"reference"`` traces two full images with the same random numbers, every pixel. Pixels that objects cover get
-more samples. Limits: one plane as local scene, distant light.
+smooth enough to be interpolated; only the rest is traced pixel by pixel. ``strategy = "difference"`` estimates the
+change itself; ``"reference"`` traces two full images with the same random numbers, every pixel. Pixels that objects
+cover get more samples. Limits: one plane as local scene, distant light.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pipeline.light.sampling import bilinear, planes
 from pipeline.run import artifacts as A
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
+from pipeline.transport.denoise import bounding_window, denoise
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.region import CELL, Region, cell_pixels, plan
@@ -106,6 +107,8 @@ def interpolated(region: Region, pixels: np.ndarray, albedo: np.ndarray, light: 
         gained=at(region.gained) * model,
         without=model,
         albedo=albedo,
+        obj_albedo=np.zeros_like(model),
+        obj_normal=np.zeros_like(model),
         ground=whole,
         obj_variance=np.zeros_like(model),
         change_variance=at(region.variance) * model**2,
@@ -155,9 +158,13 @@ def compute(
     if len(traced):
         parts.append(trace_region(worlds, rays[traced], params))
     pixels = np.concatenate([smooth, traced])
-    samples, weight = Samples.joined(parts), region.weight
-    layers = to_layers(samples, pixels, weight, shape, light)
-    numbers = measure(samples, weight, layers, light, params)
+    samples = Samples.joined(parts)
+    images = to_images(samples, pixels, shape, light)
+    numbers = measure(samples, region.weight, light, params)
+    if params.denoise:
+        images, moved = quieted(images, region.traced)
+        numbers |= moved
+    layers = to_layers(images, region.weight)
     numbers["traced_fraction"] = float(region.traced.mean())
     numbers["variant"] = mi.variant()
     if samples.not_finite:
@@ -175,45 +182,71 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
     return Raster({name: np.zeros(shape, np.float32) for name in [*names, "obj.A", "ground", "influence"]}, ACESCG)
 
 
-def to_layers(
-    samples: Samples, pixels: np.ndarray, weight: np.ndarray, shape: tuple[int, int], light: np.ndarray
-) -> Raster:
-    """Scatter the traced pixels into plate-sized channels; the feather scales the difference."""
+def to_images(samples: Samples, pixels: np.ndarray, shape: tuple[int, int], light: np.ndarray) -> dict[str, np.ndarray]:
+    """Every field of the samples as a picture (H, W, ...), zero where nothing was computed; LS_noobj in closed form."""
+    images = {}
+    for name, values in vars(samples).items():
+        if name != "not_finite":
+            image = np.zeros((shape[0] * shape[1], *values.shape[1:]))
+            image[pixels] = values
+            images[name] = image.reshape(*shape, *values.shape[1:])
+    images["without"] = images["albedo"] * light / np.pi  # equation 7
+    return images
 
-    def place(values: np.ndarray) -> np.ndarray:
-        image = np.zeros((shape[0] * shape[1], *values.shape[1:]), np.float32)
-        image[pixels] = values
-        return image.reshape(*shape, *values.shape[1:])
 
-    fade = weight.ravel()[pixels, None]
-    without = samples.albedo * light / np.pi  # equation 7: in closed form, so without noise
-    lost, gained = samples.lost * fade, samples.gained * fade
+def quieted(images: dict[str, np.ndarray], traced: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Lost and gained light and the object layer, denoised; the pictures, and how much light was in speckles."""
+    from scipy.ndimage import distance_transform_edt
+
+    window = bounding_window(traced)
+    view = {name: image[window] for name, image in images.items()}
+    model, shown = view["without"], view["alpha"][..., None]
+    bare = (model > 0).all(-1)
+    # Below an object the ground's values continue, so that its outline is no edge of theirs.
+    nearest = distance_transform_edt(~bare, return_distances=False, return_indices=True) if bare.any() else None
+
+    def relative(part: np.ndarray) -> np.ndarray:
+        ratio = np.divide(part, model, out=np.zeros_like(part), where=model > 0)
+        return ratio if nearest is None else ratio[tuple(nearest)]
+
+    guide = np.repeat(view["ground"][..., None], 3, -1)
+    survives, _ = denoise(np.maximum(1 + relative(view["lost"]), 0), guide)
+    added, moved = denoise(relative(view["gained"]), guide)
+    obj, moved_obj = denoise(view["obj"], view["obj_albedo"], view["obj_normal"])
+    result = {name: image.copy() for name, image in images.items() if name in ("lost", "gained", "obj")}
+    here = traced[window][..., None]
+    result["lost"][window] = np.where(here, np.minimum(survives - 1, 0) * model, view["lost"])
+    result["gained"][window] = np.where(here, added * model, view["gained"])
+    result["obj"][window] = np.where(shown > 0, obj, view["obj"])
+    return images | result, {"speckle_light_moved_change": moved, "speckle_light_moved_object": moved_obj}
+
+
+def to_layers(images: dict[str, np.ndarray], weight: np.ndarray) -> Raster:
+    """Channels of the size of the plate; the feather scales the change."""
+    fade = weight[..., None]
+    lost, gained = images["lost"] * fade, images["gained"] * fade
     layers = {
-        "obj": samples.obj,
-        "with": without + lost + gained,
-        "without": without,
+        "obj": images["obj"],
+        "with": images["without"] + lost + gained,
+        "without": images["without"],
         "lost": lost,
         "gained": gained,
-        "variance": samples.change_variance * fade**2,
-        "objvariance": samples.obj_variance,
+        "variance": images["change_variance"] * fade**2,
+        "objvariance": images["obj_variance"],
     }
-    channels = {
-        name: values for layer, rgb in layers.items() for name, values in Raster.split(place(rgb), layer).items()
-    }
-    channels |= {"obj.A": place(samples.alpha), "ground": place(samples.ground), "influence": weight}
+    channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(rgb, layer).items()}
+    channels |= {"obj.A": images["alpha"], "ground": images["ground"], "influence": weight}
     return Raster(channels, ACESCG)
 
 
-def measure(
-    samples: Samples, weight: np.ndarray, layers: Raster, light: np.ndarray, params: knobs.Render
-) -> dict[str, Any]:
-    """What was traced, how noisy it is, and how well the closed form of LS_noobj agrees with the render."""
+def measure(samples: Samples, weight: np.ndarray, light: np.ndarray, params: knobs.Render) -> dict[str, Any]:
+    """What was traced, how noisy it is before denoising, and how well the closed form agrees with LS_noobj."""
     model = samples.albedo * light / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
     covered = samples.alpha > 0.99
     numbers: dict[str, Any] = {
         "influenced_fraction": float((weight > 0).mean()),
-        "object_fraction": float((layers["obj.A"] > 0).mean()),
+        "object_fraction": float((samples.alpha > 0).sum() / weight.size),
         "not_finite_samples": samples.not_finite,
     }
     if bare.any():
@@ -244,6 +277,12 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "modelled": f"{numbers['traced_fraction']:.1%} of the frame traced, the rest of the region interpolated",
             "because": "second differences of the pilot bound the error of interpolation",
             "could_cost": f"{params.threshold / 2:.2%} of the plate, and the pilot's noise",
+        },
+        {
+            "term": "denoiser",
+            "modelled": params.denoise,
+            "because": f"knob render.denoise; {params.samples} samples leave noise",
+            "could_cost": "fine detail of reflections; sharpness of caustics",
         },
         {
             "term": "path depth",

@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.transport.scene import Worlds
-from pipeline.transport.trace import NEVER, Rays, Samples, camera_rays, collect, make_sampler
+from pipeline.transport.trace import NEVER, Rays, Samples, camera_rays, collect, make_sampler, object_surface
 
 
 def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
@@ -47,15 +47,15 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     # Cone samples: what the object sends instead, less what it hides.
     toward, pdf_toward = sample_cone(mi, dr, worlds, origin, sampler.next_1d(), sampler.next_2d())
     cos_toward = dr.dot(toward, normal)
-    shot = mi.Ray3f(origin, toward)
-    meets = on_ground & (cos_toward > 0) & (pdf_toward > 0) & scene.ray_test(shot, on_ground & (cos_toward > 0))
+    aimed = on_ground & (cos_toward > 0) & (pdf_toward > 0)
+
+    # One path per sample: on from the camera where an object is seen, else from the ground towards an object.
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER, "hide_emitters": True})
+    onward = mi.RayDifferential3f(dr.select(on_object, ray.o, origin), dr.select(on_object, ray.d, toward))
+    found, arrives, _ = integrator.sample(scene, sampler, onward, active=on_object | aimed)
+    meets = aimed & arrives
     hidden, pdf_light = distant_light(mi, worlds, hit, toward, meets)
     lost -= dr.select(meets, hidden * cos_toward / (pdf_light + pdf_toward), mi.Color3f(0.0))
-
-    # One path per sample: on from the camera where an object is seen, else from the ground to the object.
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER, "hide_emitters": True})
-    onward = mi.RayDifferential3f(dr.select(on_object, ray.o, shot.o), dr.select(on_object, ray.d, shot.d))
-    found = integrator.sample(scene, sampler, onward, active=on_object | meets)[0]
     albedo = dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), mi.Color3f(0.0))
     brdf = albedo * dr.inv_pi
     gained = dr.select(meets, found * cos_toward / pdf_toward, mi.Color3f(0.0)) * brdf
@@ -70,6 +70,7 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
         gained=dr.select(finite, gained, zero),
         without=zero + 0 * albedo,
         albedo=albedo,
+        surface=object_surface(mi, hit, on_object),
         masks=(on_object, on_ground, finite),
     )
 

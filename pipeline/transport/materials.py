@@ -104,6 +104,9 @@ def register(mi: Any) -> None:
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             return self._value_and_pdf(si, wo, active)
 
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            return self.base.eval(si, active)
+
         def to_string(self) -> str:
             return f"GltfBsdf[base={self.base}, metallic={self.metallic}, roughness={self.roughness}]"
 

@@ -1,8 +1,9 @@
 """Where the objects change the photograph, and how finely that has to be computed.
 
 A pilot estimates the change on cells of `CELL` pixels. Cells below the threshold are left to the plate. Where the
-change, relative to LS_noobj, bends so little from cell to cell that linear interpolation errs by less than the tolerance, the
-pilot itself is the answer (soft shadows far from the object are smooth); elsewhere every pixel is traced.
+change, relative to LS_noobj, bends so little from cell to cell that linear interpolation errs by less than the
+tolerance, the pilot itself is the answer (soft shadows far from the object are smooth); elsewhere every pixel is
+traced.
 """
 
 from __future__ import annotations

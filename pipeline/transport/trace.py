@@ -1,9 +1,10 @@
 """Rays through the photographed lens, and the reference strategy: two full path-traced images.
 
 A camera sample that meets an object goes to the object layer (premultiplied); one that meets the local scene
-contributes to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples and
-edges are exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The reference traces
-every sample in both worlds with the same random numbers; `pipeline.transport.difference` is the fast strategy.
+contributes to LS_obj, LS_noobj and their difference, so coverage, object and difference come from the same samples
+and edges are exact. Camera rays go through the inverse of the lens: neither plate nor layers are ever resampled. The
+reference traces every sample in both worlds with the same random numbers; `pipeline.transport.difference` is the fast
+strategy.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from pipeline.transport.scene import Worlds
 
-RAYS_PER_BLOCK = 1 << 21  # wavefront size: 21 floats per ray are kept until the samples of a pixel are summed
+RAYS_PER_BLOCK = 1 << 21  # wavefront size: 30 floats per ray are kept until the samples of a pixel are summed
 NEVER = 1 << 20  # Russian roulette is left off: it adds noise to the difference of two paths
 
 
@@ -61,6 +62,8 @@ class Samples:
     gained: np.ndarray  # (N, 3) light that the objects add
     without: np.ndarray  # (N, 3) LS_noobj
     albedo: np.ndarray  # (N, 3) albedo of the local scene where it is seen
+    obj_albedo: np.ndarray  # (N, 3) base colour of the objects, premultiplied
+    obj_normal: np.ndarray  # (N, 3) shading normal of the objects, world, premultiplied
     ground: np.ndarray  # (N,) share of samples that meet the local scene
     obj_variance: np.ndarray  # (N, 3)
     change_variance: np.ndarray  # (N, 3) of lost + gained
@@ -170,32 +173,51 @@ def reference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: 
         gained=dr.maximum(difference, 0.0),
         without=dr.select(kept, without_objects, mi.Color3f(0.0)),
         albedo=dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), mi.Color3f(0.0)),
+        surface=object_surface(mi, hit, on_object),
         masks=(on_object, on_ground, finite),
     )
 
 
+def object_surface(mi: Any, hit: Any, on_object: Any) -> tuple[Any, Any]:
+    """Base colour and shading normal where an object is met, else zero: what a denoiser may lean on."""
+    import drjit as dr
+
+    base = hit.bsdf().eval_diffuse_reflectance(hit, on_object)
+    return dr.select(on_object, base, mi.Color3f(0.0)), dr.select(on_object, hit.sh_frame.n, mi.Normal3f(0.0))
+
+
 def collect(
-    mi: Any, count: int, obj: Any, lost: Any, gained: Any, without: Any, albedo: Any, masks: tuple[Any, Any, Any]
+    mi: Any,
+    count: int,
+    obj: Any,
+    lost: Any,
+    gained: Any,
+    without: Any,
+    albedo: Any,
+    surface: tuple[Any, Any],
+    masks: tuple[Any, Any, Any],
 ) -> Samples:
     """Sum the samples of each pixel. ``masks``: meets an object, meets the local scene, is finite."""
     import drjit as dr
 
     ones = [dr.select(mask, mi.Float(1.0), mi.Float(0.0)) for mask in (masks[0], masks[1], ~masks[2])]
     change = lost + gained
-    planes = [*obj, *lost, *gained, *without, *albedo, *dr.square(obj), *dr.square(change), *ones]
+    triples = [obj, lost, gained, without, albedo, *surface, dr.square(obj), dr.square(change)]
+    planes = [*(channel for triple in triples for channel in triple), *ones]
     planes = [mi.Float(plane) for plane in planes]
     dr.eval(planes)  # once, else each sum below would run the whole kernel again
     means = np.stack([np.asarray(dr.block_sum(plane, count)) for plane in planes]).astype(np.float64) / count
-    names = ("obj", "lost", "gained", "without", "albedo", "obj_square", "change_square")
+    names = ("obj", "lost", "gained", "without", "albedo", "obj_albedo", "obj_normal", "obj_square", "change_square")
     triple = {name: means[3 * i : 3 * i + 3].T for i, name in enumerate(names)}
+    alpha, ground, not_finite = means[3 * len(names) :]
     spread = 1.0 / max(count - 1, 1)
     obj_square, change_square = triple.pop("obj_square"), triple.pop("change_square")
     mean_change = triple["lost"] + triple["gained"]
     return Samples(
         **triple,
-        alpha=means[21],
-        ground=means[22],
+        alpha=alpha,
+        ground=ground,
         obj_variance=np.maximum(obj_square - triple["obj"] ** 2, 0) * spread,
         change_variance=np.maximum(change_square - mean_change**2, 0) * spread,
-        not_finite=round(means[23].sum() * count),
+        not_finite=round(not_finite.sum() * count),
     )
