@@ -36,7 +36,7 @@ class ViewMap:
 def toward_photographer(height: int, width: int, to_camera: np.ndarray, distance: float) -> np.ndarray:
     """Softness (H, W) in [0, 1]: 1 where camera or photographer hide the room, given the direction (3,) to the camera.
 
-    The camera is a disc of 0.12 m; the photographer a column 16 degrees to either side, from 10 degrees above the camera
+    The camera is a disc of 0.12 m; the photographer a column 16 degrees to either side, from 10 degrees above it
     down to 12 degrees below the horizon, where the table hides the rest. Edges fade over 2 degrees.
     """
     w = latlong_directions(height, width)
@@ -111,7 +111,7 @@ def merge(views: list[ViewMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def fill(rgb: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Radiance (H, W, 3) with unknown texels taken from ever wider solid-angle means of known neighbours.
 
-    ``known`` (H, W) in [0, 1]. A pyramid: each level halves the map, gaps take the interpolated coarser level (push-pull,
+    ``known`` (H, W) in [0, 1]. A pyramid: each level halves the map, gaps take the interpolated coarser one (push-pull,
     Gortler et al., The Lumigraph, 1996). Positive input gives positive output.
     """
     height, width = known.shape
@@ -142,8 +142,8 @@ def lay_plate(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
     """Directions that meet the plane y = 0 near the ball show the plate's pixel there, not the ball's reflection.
 
-    The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same diffuse
-    plane without the ball. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees below the horizon, in full from
+    The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same
+    plane, taken as diffuse, without it. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees down, fully from
     11: within 8 radii of the foot. Returns radiance, variance, seen and the fraction of the sphere that was laid.
     """
     height, width = seen.shape

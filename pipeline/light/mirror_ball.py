@@ -6,7 +6,7 @@ centre passes the centre at distance ``D sin rho``, so it meets the ball (radius
     theta = 2 i - rho,   rho = asin(k sin i)
 from the direction ball -> camera. theta grows with i up to ``pi - asin(k)``: the cone of half angle asin(k) behind the
 ball is blind. For k -> 0 this is Debevec's (1998) ``theta = 2 asin(r)``, r = sin i the radius as a fraction of the
-silhouette's. Directions belong to infinitely distant light; near surfaces are displaced by at most R over their distance.
+silhouette's. Directions belong to infinitely distant light; near surfaces are displaced by up to R / distance.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def deviation(sine: np.ndarray, ratio: float) -> np.ndarray:
 
 
 def incidence(theta: np.ndarray, ratio: float) -> np.ndarray:
-    """Incidence i [rad] that reflects towards ``theta``: inverse of `deviation` by Newton; above pi/2 in the blind cone."""
+    """Incidence i [rad] that reflects towards ``theta``, by Newton: inverse of `deviation`; over pi/2 if blind."""
     angle = theta / (2 - np.asarray(ratio, theta.dtype))
     k = angle.dtype.type(ratio)
     for _ in range(NEWTON_STEPS):
@@ -107,8 +107,8 @@ def unwrap(
 ) -> Unwrapped:  # fmt: skip
     """Lat-long map (height, width), world frame, of the ball in ``picture`` (H, W, C); radiance as photographed.
 
-    Each texel is the solid-angle mean of ``supersample**2`` bilinear lookups; lookups outside the frame or beyond ``rim``
-    of the silhouette's radius are left out. ``centre`` (3,) of the ball is in the camera frame, metres.
+    Each texel is the solid-angle mean of ``supersample**2`` bilinear lookups; those outside the frame or beyond
+    ``rim`` of the silhouette's radius are left out. ``centre`` (3,) of the ball is in the camera frame, metres.
     """
     values = np.zeros((height, width, picture.shape[2]), np.float32)
     coverage, sine_map = np.zeros((height, width), np.float32), np.full((height, width), np.nan, np.float32)
@@ -125,14 +125,14 @@ def unwrap(
             total += supersample * weight
             for du in offsets:
                 w = _directions(v + dv, np.arange(width) + du, height, width, rotation)
-                rays, sine = rays_from_directions(w, np.float32(-centre / distance), radius / distance)
+                rays, sine = rays_from_directions(w, (-centre / distance).astype(np.float32), radius / distance)
                 x, y, inside = _pixels(camera, rays)
                 use = weight * (inside & (sine <= rim))
                 values[block] += use[..., None] * bilinear(groups, x, y)
                 coverage[block] += use
         _, sine = rays_from_directions(
             _directions(v + 0.5, np.arange(width) + 0.5, height, width, rotation),
-            np.float32(-centre / distance), radius / distance,
+            (-centre / distance).astype(np.float32), radius / distance,
         )  # fmt: skip
         sine_map[block] = sine
         values[block] /= np.where(coverage[block] > 0, coverage[block], 1)[..., None]
@@ -145,12 +145,12 @@ def _directions(row: np.ndarray, column: np.ndarray, height: int, width: int, ro
     theta, phi = np.pi * row / height, 2 * np.pi * column / width
     ring = np.stack([np.sin(phi), 0 * phi, -np.cos(phi)], -1) @ rotation.T
     up = np.cos(theta)[:, None] * rotation[:, 1]
-    return np.float32(np.sin(theta))[:, None, None] * np.float32(ring) + np.float32(up)[:, None, :]
+    return (np.sin(theta)[:, None, None] * ring + up[:, None, :]).astype(np.float32)
 
 
 def _pixels(camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels x, y of rays (..., 3), float32, and whether bilinear lookup there is inside the frame."""
-    xy = distort(np.float32(camera.distortion), rays[..., :2] / rays[..., 2:])
+    xy = distort(camera.distortion.astype(np.float32), rays[..., :2] / rays[..., 2:])
     x = xy[..., 0] * np.float32(camera.fx) + np.float32(camera.cx)
     y = xy[..., 1] * np.float32(camera.fy) + np.float32(camera.cy)
     inside = (x >= 0.5) & (x <= camera.width - 0.5) & (y >= 0.5) & (y <= camera.height - 0.5) & (rays[..., 2] > 0)

@@ -21,6 +21,6 @@ def bilinear(groups: list[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarr
     """
     import cv2
 
-    map_x, map_y = np.float32(x) - np.float32(HALF_PIXEL), np.float32(y) - np.float32(HALF_PIXEL)
+    map_x, map_y = ((np.asarray(p) - HALF_PIXEL).astype(np.float32) for p in (x, y))
     found = [cv2.remap(group, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for group in groups]
     return np.concatenate([f.reshape(*x.shape, -1) for f in found], -1)

@@ -1,12 +1,12 @@
 """The mirror ball in a photograph, found and fitted as a sphere under the lens, with the plane it stands on as a prior.
 
 The silhouette of a sphere is the cone of half angle ``rho = asin(R / D)`` about the ray to its centre, so the residual
-of an edge point is its ray's angle to the centre less rho, in pixels; three unknowns, exact off axis and under distortion.
+of an edge point is its ray's angle to the centre less rho, in pixels; exact off axis and under distortion.
 
 A mirror's rim continues its background: at grazing incidence it reflects what is behind it. Single edge points are
 therefore weak, and grain, shadows and mirrored edges are strong. So the outline votes first, all azimuths at once and
-every slope saturating (`settle`); only then are edge points taken, close to it, for the least squares. The steepest place
-of a rim lies a little inside the silhouette: that inset is a fourth unknown, with a prior; it trades against the
+every slope saturating (`settle`); only then are edge points taken, close to it, for the least squares. The steepest
+place of a rim lies a little inside the silhouette: that inset is a fourth unknown, with a prior; it trades against the
 distance, which is why the height of the centre over the plane, when the ball stands on it, carries the distance.
 """
 
@@ -20,7 +20,8 @@ from pipeline.camera.lens import project, unproject
 from pipeline.light.sampling import bilinear, planes
 from pipeline.types import Camera
 
-# Of the steepest place of the rim's profile, measured on ray-traced balls of 30 to 200 px (tests/test_probe.py).
+# Of the steepest place of the rim's profile: 0.0 to 0.15 px on sharp ray-traced balls, 0.3 to 0.8 px on two blurred,
+# demosaicked captures where the distance was known.
 INSET_PX, INSET_SIGMA_PX = 0.4, 0.4
 WINDOW_PX = 2.0  # half width of the search for edge points about the settled outline
 SEARCH_AZIMUTHS, SEARCH_RADIUS_PX = 36, 20.0
@@ -196,8 +197,9 @@ def settle(
 ) -> tuple[np.ndarray, float, float]:
     """Centre (3,) on the plane near a seed where the outline has most votes; those, and the median votes about it.
 
-    Three grids of centres, from a tenth of the radius or more to an eighth of a pixel. A vote is the slope across the outline over that slope plus
-    twice the slope usual beside the ball, times how squarely it points across; ``signals`` (H, W) vote alike.
+    Three grids of centres, from a tenth of the radius or more to an eighth of a pixel. A vote is the slope across
+    the outline over that slope plus twice the slope usual beside the ball, times how squarely it points across;
+    ``signals`` (H, W) vote alike.
     """
     along = np.linalg.svd(height.normal[None])[2][1:]
     centre, votes, chance = seed + height.normal * (radius - height.of(seed)), 0.0, 0.0
@@ -251,13 +253,17 @@ def _around(
 
 
 def fit_sphere(
-    signals: list[np.ndarray], camera: Camera, radius: float, seed: np.ndarray, height: Height
+    signals: list[np.ndarray],
+    camera: Camera,
+    radius: float,
+    settled: tuple[np.ndarray, float, float],
+    height: Height,
 ) -> tuple[SphereFit, SphereFit]:
-    """Fit the centre (3,) [m, camera frame] from a seed within ten pixels: with the plane, and without it.
+    """Fit the centre (3,) [m, camera frame] about a settled place: with the plane, and without it.
 
     Without the plane the distance rests on the radius of the rim alone, and inherits the uncertainty of its inset.
     """
-    start, votes, chance = settle(signals, camera, radius, seed, height)
+    start, votes, chance = settled
     typical = radius_in_pixels(camera, start, radius)
     azimuth = _azimuths(int(np.clip(np.pi * typical, 60, 720)))  # one ray every two pixels: edges nearly independent
     visible = fraction_in_frame(camera, start, radius)
