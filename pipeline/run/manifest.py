@@ -124,6 +124,9 @@ class CaptureFacts(Strict):
         unknown = [pose.view for pose in self.pose if pose.view not in views]
         if unknown:
             raise ValueError(f"pose.view is {unknown}; expected one of {sorted(views)}")
+        twice = sorted({pose.view for pose in self.pose if [other.view for other in self.pose].count(pose.view) > 1})
+        if twice:
+            raise ValueError(f"pose.view {twice} has several [[pose]] tables; expected one per view")
         if not self.camera.calibration and self.camera.given is None:
             raise ValueError("camera: neither calibration photographs nor given numbers")
         if self.camera.calibration and self.board is None:
@@ -215,6 +218,8 @@ def known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 def line_of(text: list[str], keys: list[str]) -> int | None:
     """Line of the key in a TOML text, found by its table headings; None when it is not there."""
     names = [key for key in keys if not key.isdigit()]
+    if not names:
+        return None
     index = next((int(key) for key in keys if key.isdigit()), 0)
     table, seen, heading = "", -1, None
     for number, line in enumerate(text, 1):
