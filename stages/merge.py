@@ -1,20 +1,21 @@
 """merge: RAW brackets -> radiance of each view before demosaicking, with variance and mask
 
 Method: per CFA cell black and clip level; noise from DNG NoiseProfile, else measured between the frames (photon
-transfer), else assumed with a warning; exposures estimated from the frames with the labels as prior; inverse-variance
-weights (Poisson or with read noise), unbiased at clip and in the dark; chi-square flags what moved; defective
-photosites replaced. pipeline/image/{radiometry,exposure,noise}.py hold the equations and their sources.
+transfer), else assumed with a warning; exposures estimated from the frames with the labels as prior, a tripod view's
+against the plate's on what the ball leaves alone; inverse-variance weights (Poisson or with read noise), unbiased at
+clip and in the dark; chi-square flags what moved; defective photosites replaced.
+pipeline/image/{radiometry,exposure,tripod,noise}.py hold the equations and their sources.
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
-Limits: frames of a view are not aligned; their shift is measured and reported. Views that share no exposure setting
-with the plate are scaled by their labels.
+Limits: frames of a view are not aligned; their shift is measured and reported. Views that neither stand where the
+plate was taken from nor share an exposure setting with a view that is tied to the plate are scaled by their labels.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
-from pipeline.image import exposure, noise, radiometry
+from pipeline.image import exposure, noise, radiometry, tripod
 from pipeline.image.exposure import Ratio
 from pipeline.image.noise import Noise
 from pipeline.image.radiometry import Exposed, Merged
@@ -35,16 +36,26 @@ from stages import knobs
 SAMPLE_PIXELS = 2_000_000  # of a frame, for ratios and photon transfer
 SHIFT_WARNING_PX = 0.5
 LABEL_WARNING = 0.1
+LIGHT_WARNING = 0.01  # static scene against shared settings
 
 
 def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.Merge) -> Result:
     """Merged mosaics by view and the exposures of their frames. Raises CaptureError when a file cannot be decoded."""
     root = Path(facts["capture_root"])
-    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params)
+    still = {ball["name"] for ball in facts.get("ball", []) if ball.get("tripod")}
+    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params, still)
 
 
-def merge_brackets(brackets: dict[str, Bracket], decode: Callable[[Frame], np.ndarray], params: knobs.Merge) -> Result:
-    """The stage on mosaics wherever they come from: ``decode(frame)`` gives (H, W) DN."""
+def merge_brackets(
+    brackets: dict[str, Bracket],
+    decode: Callable[[Frame], np.ndarray],
+    params: knobs.Merge,
+    still: Collection[str] = (),
+) -> Result:
+    """The stage on mosaics wherever they come from: ``decode(frame)`` gives (H, W) DN.
+
+    ``still``: views taken from where the plate was taken.
+    """
     workers = os.cpu_count() or 1
     entries = [(view, frame) for view, bracket in sorted(brackets.items()) for frame in _ordered(bracket.frames)]
     views, frames = [view for view, _ in entries], [frame for _, frame in entries]
@@ -52,8 +63,11 @@ def merge_brackets(brackets: dict[str, Bracket], decode: Callable[[Frame], np.nd
         mosaics = list(pool.map(decode, frames))
     warnings: list[str] = []
     models, limits, noise_numbers = _noise_models(views, frames, mosaics, warnings)
-    ratios = _ratios(views, frames, mosaics, models, limits) if params.estimate_exposures else []
-    offsets, sigmas = _exposures(views, frames, ratios, params, warnings)
+    ratios, across = [], []
+    if params.estimate_exposures:
+        ratios = _ratios(views, frames, mosaics, models, limits)
+        across = _ratios_across(views, frames, mosaics, models, limits, still)
+    offsets, sigmas = _exposures(views, frames, [*ratios, *across], params, warnings)
     exposed = [
         Exposed(
             mosaic, exposure.exposure_of(frame) * float(np.exp(offset)), frame_black(frame), frame.white, limit, model
@@ -70,8 +84,13 @@ def merge_brackets(brackets: dict[str, Bracket], decode: Callable[[Frame], np.nd
         _warn_extremes(view, numbers[view], warnings)
     listing = _exposure_rows(brackets, views, frames, exposed, offsets, sigmas)
     shifts = _shifts(views, exposed)
-    evidence = _evidence(models, ratios, shifts, numbers, warnings)
-    totals = {"noise": noise_numbers, "ratios_measured": len(ratios), "shift_px": max(shifts.values(), default=0.0)}
+    evidence = _evidence(models, ratios, across, shifts, numbers, warnings)
+    totals = {
+        "noise": noise_numbers,
+        "ratios_measured": len(ratios),
+        "against_plate": _across_numbers(views, frames, across, offsets, warnings),
+        "shift_px": max(shifts.values(), default=0.0),
+    }
     return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
 
 
@@ -94,9 +113,9 @@ def _sample(mosaic: np.ndarray) -> np.ndarray:
 
 
 def _signal(frame: Frame, mosaic: np.ndarray) -> np.ndarray:
-    """(N,) normalised signal of the sample."""
+    """(h, W) normalised signal of the sample."""
     blank = Noise(np.zeros((2, 2)), np.zeros((2, 2)), "")
-    return Exposed(_sample(mosaic), 1.0, frame_black(frame), frame.white, np.ones((2, 2)), blank).signal().ravel()
+    return Exposed(_sample(mosaic), 1.0, frame_black(frame), frame.white, np.ones((2, 2)), blank).signal()
 
 
 def _neighbours(views: list[str], frames: list[Frame]) -> list[tuple[int, int]]:
@@ -169,7 +188,7 @@ def _transfer(
         if long in members and short in members:
             black = frame_black(frames[long])
             limit = float(((level - black) * step).min()) - 0.02
-            a, b = _signal(frames[long], mosaics[long]), _signal(frames[short], mosaics[short])
+            a, b = (_signal(frames[i], mosaics[i]).ravel() for i in (long, short))
             label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
             rough = (noise.assumed(frames[long].iso, 1 / step),) * 2
             measured = exposure.measure_ratio(a, b, label, limit, rough)
@@ -184,13 +203,57 @@ def _ratios(
     """Measured exposure ratios of neighbouring frames."""
     ratios = []
     for long, short in _neighbours(views, frames):
-        a, b = _signal(frames[long], mosaics[long]), _signal(frames[short], mosaics[short])
+        a, b = (_signal(frames[i], mosaics[i]).ravel() for i in (long, short))
         label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
         limit = float(min(limits[long].min(), limits[short].min()))
         found = exposure.measure_ratio(a, b, label, limit, (models[long], models[short]))
         if found is not None:
             ratios.append(Ratio(long, short, *found))
     return ratios
+
+
+def _ratios_across(
+    views: list[str],
+    frames: list[Frame],
+    mosaics: list[np.ndarray],
+    models: list[Noise],
+    limits: list[np.ndarray],
+    still: Collection[str],
+) -> list[Ratio]:
+    """Exposure ratios of the plate's frames and the still views' frames."""
+    labels = [exposure.exposure_of(frame) for frame in frames]
+    members = {view: [i for i, name in enumerate(views) if name == view] for view in sorted({"plate", *still})}
+    plates = members.pop("plate")
+    wanted = [*plates, *(i for group in members.values() for i in group)] if any(members.values()) else []
+    blocks = {i: tripod.blocks_of(_signal(frames[i], mosaics[i]), float(limits[i].min()), models[i]) for i in wanted}
+    found = []
+    for group in members.values():
+        pairs = tripod.measure_views([(labels[i], blocks[i]) for i in plates], [(labels[i], blocks[i]) for i in group])
+        found += [Ratio(plates[p], group[b], one.log, one.sigma, one.blocks) for p, b, one in pairs]
+    return found
+
+
+def _across_numbers(
+    views: list[str], frames: list[Frame], across: list[Ratio], offsets: np.ndarray, warnings: list[str]
+) -> dict[str, dict[str, float]]:
+    """Pairs of each still view, and how the static scene's brightness differs from what the exposures explain."""
+    numbers: dict[str, dict[str, float]] = {}
+    for view in sorted({views[ratio.short] for ratio in across}):
+        pairs = [ratio for ratio in across if views[ratio.short] == view]
+        left = [
+            ratio.log
+            - np.log(exposure.exposure_of(frames[ratio.short]) / exposure.exposure_of(frames[ratio.long]))
+            - (offsets[ratio.short] - offsets[ratio.long])
+            for ratio in pairs
+        ]
+        numbers[view] = {"pairs": len(pairs), "light_change_rel": float(np.expm1(np.mean(left)))}
+        change = numbers[view]["light_change_rel"]
+        if abs(change) > LIGHT_WARNING:
+            warnings.append(
+                f"{view}: the scene is {abs(change):.1%} {'brighter' if change > 0 else 'darker'} than in the plate, "
+                "judged by the exposure settings that tie them; the light changed in between"
+            )
+    return numbers
 
 
 def _exposures(
@@ -213,7 +276,10 @@ def _exposures(
     groups = exposure.linked_views(views, speeds, ratios)
     linked = set().union(*(group for group in groups if "plate" in group)) if "plate" in views else set(views)
     for view in sorted(set(views) - linked):
-        warnings.append(f"{view}: shares no exposure setting with the plate; its scale rests on labels (about 5 %)")
+        warnings.append(
+            f"{view}: neither static scene nor exposure setting ties it to the plate; "
+            "its scale rests on labels (about 5 %)"
+        )
     return offsets, sigmas
 
 
@@ -314,7 +380,12 @@ def _shifts(views: list[str], exposed: list[Exposed]) -> dict[str, float]:
 
 
 def _evidence(
-    models: list[Noise], ratios: list[Ratio], shifts: dict[str, float], numbers: dict[str, Any], warnings: list[str]
+    models: list[Noise],
+    ratios: list[Ratio],
+    across: list[Ratio],
+    shifts: dict[str, float],
+    numbers: dict[str, Any],
+    warnings: list[str],
 ) -> list[dict[str, Any]]:
     moved = max(shifts.values(), default=0.0)
     if moved > SHIFT_WARNING_PX:
@@ -330,8 +401,8 @@ def _evidence(
         },
         {
             "term": "exposure errors",
-            "modelled": bool(ratios),
-            "because": f"{len(ratios)} ratios measured between frames",
+            "modelled": bool(ratios or across),
+            "because": f"{len(ratios)} ratios measured between frames of a view, {len(across)} between plate and ball",
             "could_cost": "up to 7 % between parts of the range that different frames cover",
         },
         {

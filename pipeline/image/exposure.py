@@ -6,7 +6,9 @@ f-number were made by one mechanical speed and are tied to each other, so that p
 data leave open, the common factor above all, is held by the labels through a heavy-tailed prior.
 
 Source: joint log-domain least squares as in Hanji, Zhong, Mantiuk 2020 (HDRutils), with labels as prior and ties added.
-Limits: a global factor is not observable; views that share no label relate only through the prior, and say so.
+Ratios between plate and ball come from pipeline/image/tripod.py.
+Limits: a global factor is not observable; views that neither a ratio nor a label joins relate only through the prior,
+and say so.
 """
 
 from __future__ import annotations

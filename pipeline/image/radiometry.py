@@ -32,6 +32,7 @@ LIMIT_MARGIN = 0.002  # of full scale kept from the clip level: knee of the conv
 GHOST_SIGMA = 5.0  # of the chi-square, as a normal deviate: one false alarm in 3.5 million photosites
 RATIO_ERROR = 0.005  # relative disagreement of frames that exposure error and flicker explain
 HOT_SIGMA = 8.0
+MAX_SUSPECTS = 0.005  # of the photosites are looked at as defects, the worst first; sensors have a tenth of it
 ISOLATION = 0.15  # a defect's neighbours of other colours show less than this of it; optics spread light wider
 NEIGHBOURS = [(dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if (dy, dx) != (0, 0)]  # same colour
 ADJACENT = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
@@ -270,7 +271,10 @@ def replace_defects(merged: Merged) -> tuple[Merged, int]:
 
 
 def _outliers(radiance: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of photosites beyond all same-colour neighbours by HOT_SIGMA."""
+    """Rows and columns of photosites beyond all same-colour neighbours by HOT_SIGMA; if many, those farthest beyond.
+
+    Texture at the scale of photosites is full of them and none is a defect.
+    """
     if min(radiance.shape) < 5:
         return np.zeros(0, int), np.zeros(0, int)
     height, width = radiance.shape
@@ -281,8 +285,13 @@ def _outliers(radiance: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, n
         np.maximum(high, view, out=high)
         np.minimum(low, view, out=low)
     reach = HOT_SIGMA * np.sqrt(variance)  # infinite where clipped: never an outlier
-    found = np.nonzero((radiance > high + reach) | (radiance < low - reach))
-    return found[0], found[1]
+    beyond = (radiance > high + reach) | (radiance < low - reach)
+    most = max(1000, round(MAX_SUSPECTS * radiance.size))
+    if np.count_nonzero(beyond) > most:
+        gap = np.maximum(radiance - high, low - radiance)[beyond] / reach[beyond]
+        beyond[beyond] = gap > np.partition(gap, -most)[-most]
+    rows, columns = np.nonzero(beyond)
+    return rows, columns
 
 
 def _excess(radiance: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
