@@ -8,6 +8,7 @@ SHELL := bash
 
 CAPTURE ?= sample_captures/desk
 SCENE ?=
+export INSITU_DATA ?= $(abspath ../shared/data)
 QUALITY ?=
 OUT ?= build/$(notdir $(CAPTURE:/=))
 PYTHON ?= python3
@@ -53,6 +54,15 @@ check: $(READY)  ## lint and type check
 docs: $(READY)  ## regenerate stages/README.md
 	@$(INSITU) docs > stages/README.md
 
+QUALITIES := draft preview final
+FIGURES := $(addprefix build/figures/desk_,$(QUALITIES)) $(if $(wildcard $(INSITU_DATA)/captures/kitchen_table),$(addprefix build/figures/kitchen_table_,$(QUALITIES)))
+
+figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
+	@for q in $(QUALITIES); do $(INSITU) run sample_captures/desk --quality $$q --out build/figures/desk_$$q; done
+	@for q in $(if $(findstring kitchen,$(FIGURES)),$(QUALITIES)); do \
+		$(INSITU) run tests/kitchen_table --quality $$q --out build/figures/kitchen_table_$$q; done
+	@$(INSITU) figures $(FIGURES) > docs/figures.md
+
 verify: $(READY)  ## recompute the digests of a build
 	@$(INSITU) verify $(CAPTURE) --out $(OUT)
 
@@ -64,4 +74,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: help setup demo all test test-all check docs verify lock clean FORCE
+.PHONY: help setup demo all test test-all check docs figures verify lock clean FORCE

@@ -63,6 +63,8 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("scene", type=Path, help="SCENE.toml")
     simulate.add_argument("folder", type=Path, help="folder of the new capture")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
+    figures = verb("figures", "print the page of figures of finished builds", capture=False)
+    figures.add_argument("builds", type=Path, nargs="+", help="build folders")
     verb("rules", "print the generated make rules", capture=False)
     verb("docs", "print the table of stages, artifacts and knobs", capture=False)
     return parser
@@ -108,6 +110,11 @@ def dispatch(args: argparse.Namespace) -> int:
         lines, healthy = examine()
         say("\n".join(lines))
         return 0 if healthy else 5
+    if args.verb == "figures":
+        from pipeline.run.figures import page
+
+        say(page(args.builds, os.cpu_count() or 1, stage_names()))
+        return 0
     if args.verb in ("rules", "docs"):
         from pipeline.run import derive
         from stages.knobs import KNOBS
