@@ -188,9 +188,14 @@ def first_calibration(
     pixels = [theirs(points).astype(np.float32) for points in px]
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     guess = cv2.initCameraMatrix2D(flat, pixels, size, 1.0)
-    _, K, distortion, rotations, translations, *_ = cv2.calibrateCameraExtended(
-        flat, pixels, size, guess, np.zeros(5), flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS
-    )
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # several add up in the order in which they end: other bytes each time
+    try:
+        _, K, distortion, rotations, translations, *_ = cv2.calibrateCameraExtended(
+            flat, pixels, size, guess, np.zeros(5), flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS
+        )
+    finally:
+        cv2.setNumThreads(threads)
     centre = ours(K[:2, 2])[0]
     camera = Camera(
         width=size[0], height=size[1], fx=K[0, 0], fy=K[1, 1], cx=centre[0], cy=centre[1],
