@@ -35,7 +35,9 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     """Photographs by view: R G B in radiance units, ACEScg; variance.RGB; mask."""
     profiles = {view: profile_of(view, raster) for view, raster in mosaics.items()}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        developed = list(pool.map(lambda view: develop(mosaics[view], profiles[view], params.demosaic, view), mosaics))
+        developed = list(
+            pool.map(lambda v: develop(mosaics[v], profiles[v], method_of(v, params.demosaic), v), mosaics)
+        )
     photographs = dict(zip(mosaics, developed))
     numbers = {view: _numbers(raster) for view, raster in photographs.items()}
     warnings, evidence = [], [_vignetting()]
@@ -45,6 +47,16 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     if profile["color_matrix_2"] is None:
         evidence.append(_one_matrix(profile))
     return Result({"photographs": photographs}, {"views": numbers}, warnings, evidence)
+
+
+def method_of(view: str, asked: Method) -> Method:
+    """The method for a view: a ball gets a linear one even where the plate gets Menon's.
+
+    Menon's chooses directions and smooths colour differences, which sharpens texture but tints a lamp a few photosites
+    wide: on the desk capture it moved the light on the walls' sides by up to 5 % in red. Linear kernels keep each
+    channel's sum.
+    """
+    return "malvar" if asked == "menon" and view != "plate" else asked
 
 
 def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:

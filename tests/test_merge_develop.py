@@ -469,3 +469,15 @@ class TestKitchenTable:
 
         relative = means(developed) / (scale * means(truth)) - 1
         assert np.median(np.abs(relative), (0, 1)).max() < 0.01
+
+
+def test_a_lamp_keeps_its_colour_in_ball_views():
+    """A few bright photosites in a dim field: the sum of each channel stays that of the mosaic (a linear kernel)."""
+    assert develop.method_of("plate", "menon") == "menon"
+    assert develop.method_of("ball_a", "menon") == "malvar"
+    mosaic = np.full((40, 40), 0.01, np.float32)
+    mosaic[18:22, 18:22] = 100.0
+    rgb = demosaic(mosaic, "RGGB", develop.method_of("ball_a", "menon"))
+    # Each photosite of R and B stands for four pixels, of G for two.
+    expected = [4 * mosaic[0::2, 0::2].sum(), 2 * (mosaic[0::2, 1::2].sum() + mosaic[1::2, 0::2].sum())]
+    np.testing.assert_allclose(rgb.sum((0, 1))[:2], expected, rtol=1e-3)  # the frame's border, 0.01 of 400
