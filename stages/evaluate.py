@@ -38,6 +38,7 @@ from pipeline.run.artifacts import (
     METRICS,
     PHOTOGRAPHS,
     PLANE,
+    RECORDS,
     SELFCHECK,
     VIEWS,
     WISHES,
@@ -59,7 +60,7 @@ STRIDE = 2  # albedo is compared at every second pixel
 def compute(
     facts: dict[str, Any], wishes: dict[str, Any], photographs: dict[str, Raster], camera: Camera,
     views: dict[str, View], balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster,
-    layers: Raster, composite: Raster, params: knobs.Evaluate,
+    layers: Raster, composite: Raster, records: dict[str, Any], params: knobs.Evaluate,
 ) -> Result:  # fmt: skip
     """Metrics (empty without truth), self-check, and the error map (1x1 without truth)."""
     plate = photographs["plate"].rgb()
@@ -82,6 +83,7 @@ def compute(
         **pose_errors(truth, camera, views, balls),
         **probe_errors(truth, environment.rgb(), found["scale"]),
         **albedo_errors(truth, camera, views["plate"], plane, albedo),
+        "seconds": {stage: record["seconds"] for stage, record in records.items()},
     }
     if found["non_finite"]:
         warnings.append(
@@ -328,6 +330,7 @@ STAGE = Stage(
     inputs={
         "facts": FACTS, "wishes": WISHES, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS, "balls": BALLS,
         "environment": ENVIRONMENT, "plane": PLANE, "albedo": ALBEDO, "layers": LAYERS, "composite": COMPOSITE,
+        "records": RECORDS,
     },
     outputs={"metrics": METRICS, "selfcheck": SELFCHECK, "error_map": ERROR_MAP},
 )  # fmt: skip

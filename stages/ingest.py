@@ -12,6 +12,8 @@ Limits: Bayer RAW of one camera; every view has the plate's size.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -103,7 +105,10 @@ def _truth(facts: CaptureFacts, manifest: Path, problems: list[str]) -> dict[str
     if not path.is_file():
         problems.append(f"{manifest}: truth: is {facts.truth!r}; no such file ({path})")
         return {}
-    return {"truth_path": str(path), "truth_sha256": file_sha256(path)}
+    root = path.parent / os.path.expandvars(json.loads(path.read_bytes()).get("root", "."))
+    files = [path, *sorted(file for file in root.glob("*") if file.is_file())]
+    together = hashlib.sha256("".join(file_sha256(file) for file in files).encode()).hexdigest()
+    return {"truth_path": str(path), "truth_sha256": together}
 
 
 def _brackets(
