@@ -54,14 +54,14 @@ check: $(READY)  ## lint and type check
 docs: $(READY)  ## regenerate stages/README.md
 	@$(INSITU) docs > stages/README.md
 
-QUALITIES := draft preview final
+QUALITIES := final preview draft
 FIGURES := $(addprefix build/figures/desk_,$(QUALITIES)) $(if $(wildcard $(INSITU_DATA)/captures/kitchen_table),$(addprefix build/figures/kitchen_table_,$(QUALITIES)))
 
 figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@for q in $(QUALITIES); do $(INSITU) run sample_captures/desk --quality $$q --out build/figures/desk_$$q; done
 	@for q in $(if $(findstring kitchen,$(FIGURES)),$(QUALITIES)); do \
 		$(INSITU) run tests/kitchen_table --quality $$q --out build/figures/kitchen_table_$$q; done
-	@$(INSITU) figures $(FIGURES) > docs/figures.md
+	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
 verify: $(READY)  ## recompute the digests of a build
 	@$(INSITU) verify $(CAPTURE) --out $(OUT)

@@ -1,4 +1,4 @@
-"""Intrinsics and distortion from board photographs, with covariance; the distortion model is chosen by held-out error.
+"""Intrinsics and distortion from board photographs, with covariance; held-out error chooses the model.
 
 Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
 (Gauss-Newton, poses eliminated). From one focal length without distortion, the terms k1, k2, separate fx and fy, p1 p2

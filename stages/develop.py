@@ -1,4 +1,4 @@
-"""develop: merged mosaics -> photographs in linear ACEScg, with variance and mask
+"""Develop merged mosaics to linear ACEScg, with variance and mask.
 
 Method: white balance of the mosaic by AsShotNeutral (so that interpolation does not colour edges), demosaicking
 (bilinear, Malvar-He-Cutler 2004 or Menon 2007), and one 3x3 matrix from camera_rgb to ACEScg by the DNG's one or two

@@ -1,4 +1,4 @@
-"""ingest: capture.toml, scene.toml and the photographs -> indexes
+"""Check capture.toml, scene.toml and every photograph; index them with their metadata.
 
 Method: both manifests are validated and every RAW file is asked for its metadata; all problems are reported together,
 one line each. Photographs are never copied: what later stages get is an index of paths, digests and metadata. This is

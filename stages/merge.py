@@ -1,4 +1,4 @@
-"""merge: RAW brackets -> radiance of each view before demosaicking, with variance and mask
+"""Merge RAW brackets to radiance before demosaicking, with variance and masks.
 
 Method: per CFA cell black and clip level; noise from DNG NoiseProfile, else measured between the frames (photon
 transfer), else assumed with a warning; exposures estimated from the frames with the labels as prior, a tripod view's

@@ -1,4 +1,4 @@
-"""The local scene's plane and the rectangle of it that is modelled; how surely objects stand on the photographed spot.
+"""The local scene's plane, the rectangle of it that is modelled, and how surely objects stand on the spot.
 
 The markers define the world, so the plane is ``y = 0`` exactly; what is uncertain is where the camera stands to it.
 Covariance: the plate's pose covariance turned into the plane's tilt and offset as seen from the camera. Contact: pose

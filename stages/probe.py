@@ -1,4 +1,4 @@
-"""probe: photographs of a mirror ball -> world-oriented environment map with variance
+"""Turn photographs of a mirror ball into a world-oriented environment map with variance.
 
 Each ball is found on the plane (radius and pose leave two unknowns), fitted as a sphere under the lens, and
 unwrapped by exact perspective reflection (`pipeline.light.mirror_ball`); radiance is the pixel's over the ball's

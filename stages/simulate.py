@@ -3,8 +3,9 @@
 A Mitsuba scene in ACEScg is photographed through a distorted, slightly soft lens onto a Bayer sensor with photon noise,
 read noise, fixed pattern, hot photosites and clipping, and written as DNGs whose shutter labels are rounded as cameras
 round them. The truth is path traced with the objects really standing there, with the glTF material, through the same
-lens; pixels that the objects cover or change get most of the samples. Plate and truth share their random numbers, so
-their difference is quieter than either; the stated noise is measured from two independent halves.
+lens; pixels that the objects cover or change get most of the samples. In the shadows the change is sampled again, with
+random numbers that both worlds share; it is added to the plate as photographed, whose own noise is part of the
+photographed surface. The stated noise is measured from independent halves.
 
 Imports nothing that estimates. Limits: the room is infinitely far away, no depth of field, no vignetting, no flare.
 """
@@ -39,6 +40,8 @@ from pipeline.simulation.world import Place
 HELP = "Make a capture with known truth from SCENE.toml into the folder OUT."
 SMOOTHING_PX = 5.0  # of the light that the ball throws
 REGION_GROWTH = 3  # pixels added round the region that gets more samples
+CHANGE_SEED = 80_000
+SHADOW = 0.05  # relative change of what is called a shadow
 
 
 @dataclass
@@ -186,18 +189,16 @@ def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> t
     refine(studio, filled, raw["with_objects"], half, region & ~covered, sampling.region, 10_000, progress)
     refine(studio, filled, raw["with_objects"], half, covered, sampling.object, 30_000, progress)
     pictures = {name: blur(values, sigma) for name, values in raw.items()}
-    for name, pixels in pictures.items():
+    found = measured_noise(pictures, blur(half, sigma), coverage.sum(-1), region)
+    truth, finer = resampled_change(studio, (filled, plate), pictures, coverage.sum(-1), progress)
+    for name, pixels in (("plate", pictures["plate"]), ("with_objects", truth)):
         capture.write_picture(out / "truth" / f"{name}.exr", pixels)
     names = [model.name for model in scene.object]
     capture.write_layers(
         out / "truth" / "coverage.exr", {n: coverage[..., i] for i, n in enumerate(names)}, studio.shape
     )
-    noise = measured_noise(pictures, blur(half, sigma), coverage.sum(-1), region)
-    return pictures["plate"], noise | {
-        "spp": sampling.object,
-        "spp_shadow": sampling.region,
-        "spp_else": sampling.plate,
-    }
+    spent = {"spp": sampling.object, "spp_shadow": sampling.region, "spp_else": sampling.plate}
+    return pictures["plate"], found | spent | finer
 
 
 def changed_region(raw: dict[str, np.ndarray], coverage: np.ndarray, sigma: float, threshold: float) -> np.ndarray:
@@ -226,15 +227,57 @@ def refine(
     half[where] = (sums[0] / ((passes + 1) // 2) - sums[1] / (passes // 2)) / 2
 
 
+def resampled_change(
+    studio: Studio, worlds: tuple[Measure, Measure], pictures: dict[str, np.ndarray], coverage: np.ndarray,
+    progress: Callable[[str], None],
+) -> tuple[np.ndarray, dict[str, float]]:  # fmt: skip
+    """with_objects (H, W, 3) with more samples of the change in the shadows, and the noise that is left there.
+
+    The change of the pictures, as their half floats store it, is averaged with that of new passes by sample count.
+    ``worlds``: with and without objects, traced with the same random numbers; ``coverage``: (H, W), of all objects.
+    """
+    sampling, sigma = studio.scene.sampling, studio.scene.camera.blur_sigma_px
+    truth, plate = (pictures[name].astype(np.float16).astype(float) for name in ("with_objects", "plate"))
+    where = shadow_pixels(truth, plate, coverage)
+    passes = sampling.change // sampling.region_pass
+    if passes < 2 or not where.any():
+        return truth, {}
+    pixels = np.flatnonzero(box_mean(where.astype(float), 1) > 0)  # the lens' blur needs the neighbours
+    shoot = camera_rays(studio.mi, studio.lens, studio.pose(studio.scene.plate))
+    sums = np.zeros((2, where.size, 3))
+    for number in range(passes):
+        progress(f"change of {len(pixels)} pixels in the shadows, pass {number + 1} of {passes}")
+        seen = [trace(studio.mi, shoot, m, pixels, sampling.region_pass, CHANGE_SEED + number) for m in worlds]
+        sums[number % 2, pixels] += seen[0].astype(float) - seen[1]
+    first, second = (blur(part.reshape(truth.shape), sigma) for part in sums)
+    new, share = (first + second) / passes, sampling.change / (sampling.change + sampling.region)
+    half = (first / ((passes + 1) // 2) - second / (passes // 2)) / 2
+    step = new - (truth - plate)
+    truth = np.where(where[..., None], truth + share * step, truth)
+    # The squared step is the old variance plus the new one, the squared half difference is the new one.
+    variance = (1 - share) ** 2 * (step**2).sum(-1) + (2 * share - 1) * (half**2).sum(-1)
+    relative = np.sqrt(box_mean(np.where(where, variance, 0))) / np.linalg.norm(truth, axis=-1)
+    strong = np.linalg.norm(truth - plate, axis=-1) > SHADOW * np.linalg.norm(plate, axis=-1)
+    mask = (box_mean(where.astype(float)) > 0.999) & strong
+    found: dict[str, float] = {"shadow_pixels": int(mask.sum()), "spp_change": sampling.change}
+    return truth, found | ({"shadow_median_rel": float(np.median(relative[mask]))} if mask.any() else {})
+
+
+def shadow_pixels(truth: np.ndarray, plate: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+    """(H, W) bool: no object is seen, and the picture changes by more than SHADOW on 5x5 means, or is near that."""
+    change = box_mean(np.linalg.norm(truth - plate, axis=-1))
+    return grow(change > SHADOW * np.linalg.norm(plate, axis=-1)) & (coverage == 0)
+
+
 def measured_noise(
     pictures: dict[str, np.ndarray], half_difference: np.ndarray, coverage: np.ndarray, region: np.ndarray
 ) -> dict[str, float]:
-    """Median relative standard deviation of the truth on the objects and in their shadows (change over 5 %)."""
+    """Median relative standard deviation of the truth on the objects and in their shadows."""
     truth, plate = pictures["with_objects"], pictures["plate"]
     rms = np.sqrt(box_mean((half_difference**2).sum(-1)))
     relative = rms / np.linalg.norm(truth, axis=-1)
     inside = box_mean(region.astype(float)) > 0.999
-    changed = np.linalg.norm(truth - plate, axis=-1) > 0.05 * np.linalg.norm(plate, axis=-1)
+    changed = np.linalg.norm(truth - plate, axis=-1) > SHADOW * np.linalg.norm(plate, axis=-1)
     masks = {"object": inside & (coverage > 0.999), "shadow": inside & (coverage == 0) & changed}
     found: dict[str, float] = {"region_fraction": float(region.mean())}
     for name, mask in masks.items():

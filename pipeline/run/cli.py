@@ -65,6 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
+    figures.add_argument("--picture", type=Path, help="also write plate and composite of the first build as JPEG")
     verb("rules", "print the generated make rules", capture=False)
     verb("docs", "print the table of stages, artifacts and knobs", capture=False)
     return parser
@@ -111,8 +112,10 @@ def dispatch(args: argparse.Namespace) -> int:
         say("\n".join(lines))
         return 0 if healthy else 5
     if args.verb == "figures":
-        from pipeline.run.figures import page
+        from pipeline.run.figures import page, write_picture
 
+        if args.picture:
+            write_picture(args.builds[0], args.picture)
         say(page(args.builds, os.cpu_count() or 1, stage_names()))
         return 0
     if args.verb in ("rules", "docs"):

@@ -79,5 +79,20 @@ def page(folders: list[Path], cores: int, stages: tuple[str, ...]) -> str:
     return "\n".join(lines)
 
 
+def write_picture(folder: Path, path: Path, width: int = 1600) -> None:
+    """Plate and composite of a build side by side, as JPEG."""
+    from PIL import Image
+
+    from pipeline.run.formats import atomic_path
+
+    pictures = [Image.open(folder / "composite" / f"{name}.png") for name in ("plate_display", "display")]
+    size = (width // 2, round(width / 2 * pictures[0].height / pictures[0].width))
+    both = Image.new("RGB", (width, size[1]))
+    for index, picture in enumerate(pictures):
+        both.paste(picture.convert("RGB").resize(size, Image.Resampling.LANCZOS), (index * size[0], 0))
+    with atomic_path(path) as scratch:
+        both.save(scratch, format="JPEG", quality=88)
+
+
 def _cell(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
