@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import ACESCG, CLIPPED
-from pipeline.image.display import auto_exposure, display_transform
+from pipeline.image.display import display_exposure, display_transform
 from pipeline.run import artifacts as A
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
@@ -55,7 +55,7 @@ def compute(photographs: dict[str, Raster], layers: Raster, params: knobs.Compos
         "obj.A": layers["obj.A"],
         "guards": built.guards,
     }
-    exposure = auto_exposure(plate.rgb()) + params.exposure_ev
+    exposure = display_exposure(plate.rgb()) + params.exposure_ev
     numbers: dict[str, Any] = {
         f"guard_{name}_px": int(((built.guards & bit) > 0).sum()) for name, bit in GUARDS.items()
     }

@@ -100,6 +100,14 @@ def test_auto_exposure_follows_exposure():
     assert display.auto_exposure(np.zeros((2, 2, 3))) == 0.0
 
 
+def test_display_exposure_lies_between_its_two_rules():
+    rgb = np.random.default_rng(4).random((200, 20, 3)) * 0.3
+    rgb[:4] = 50.0  # a lamp of two per cent
+    first = display.display_exposure(rgb)
+    assert display.display_exposure(4 * rgb) == pytest.approx(first - 2)
+    assert np.log2(display.DIFFUSE_WHITE / 50) < first < display.auto_exposure(rgb)
+
+
 def test_constants_against_colour_science():
     colour = pytest.importorskip("colour")
     space = colour.models.RGB_COLOURSPACE_ACESCG

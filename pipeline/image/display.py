@@ -20,6 +20,7 @@ BUILTIN_CONFIG = "ocio://cg-config-v4.0.0_aces-v2.0_ocio-v2.5"
 DISPLAY = "sRGB - Display"
 VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 MID_GREY = 0.18
+DIFFUSE_WHITE = 0.9
 THREADS = 2  # the processor releases the GIL: two row blocks take half the time of one
 
 # AP1 -> AP0, S-2014-004 (ACEScg), appendix A; only for configs that know ACES2065-1 and not ACEScg.
@@ -49,9 +50,21 @@ def auto_exposure(rgb: np.ndarray) -> float:
 
     Only finite, positive pixels count; 0 when there are none.
     """
-    values = colour.luminance(rgb).ravel()
-    values = values[np.isfinite(values) & (values > 0)]
-    return float(np.log2(MID_GREY / np.median(values))) if values.size else 0.0
+    return _exposure(rgb, 0.5, MID_GREY)
+
+
+def display_exposure(rgb: np.ndarray) -> float:
+    """Exposure [EV] of a picture to look at: halfway between the median at mid grey and the bright parts at white.
+
+    The median alone leaves a wooden table with a sheet of paper too dark, the bright parts alone a room with a lamp.
+    """
+    return 0.5 * (_exposure(rgb, 0.5, MID_GREY) + _exposure(rgb, 0.99, DIFFUSE_WHITE))
+
+
+def _exposure(rgb: np.ndarray, quantile: float, target: float) -> float:
+    luminance = rgb.reshape(-1, 3) @ AP1_LUMINANCE
+    luminance = luminance[np.isfinite(luminance) & (luminance > 0)]
+    return float(np.log2(target / np.quantile(luminance, quantile))) if luminance.size else 0.0
 
 
 def display_transform(

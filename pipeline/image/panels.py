@@ -12,7 +12,7 @@ from pipeline.conventions import CLIPPED, DARK, GHOST, HOT, latlong_from_directi
 from pipeline.image import figures as fig
 from pipeline.image import pictures
 from pipeline.image.colour import convert, encode_srgb, luminance
-from pipeline.image.display import auto_exposure, display_transform
+from pipeline.image.display import display_exposure, display_transform
 from pipeline.light import prediction
 from pipeline.transport import differential as d
 from pipeline.types import BallFit, Bracket, Camera, Plane, Raster, View
@@ -133,7 +133,7 @@ def ball_rows(build: Build) -> dict[str, Any] | None:
         directions, sine = prediction.ball_directions(build.camera, ball, view, rows_at, columns)
         predicted = prediction.mirrored_picture(light, directions, reflectance)
         inside = np.isfinite(sine)
-        exposure = auto_exposure(photograph[inside])
+        exposure = display_exposure(photograph[inside])
         shown = np.where(inside[..., None], predicted, photograph)
         below = luminance(photograph)
         difference = np.where(inside & (below > 0), luminance(predicted) / np.where(below > 0, below, 1) - 1, np.nan)
@@ -189,7 +189,7 @@ def shutter(seconds: float) -> str:
 
 def develop_part(build: Build) -> dict[str, Any]:
     """Every view at the plate's exposure."""
-    exposure = auto_exposure(build.photographs["plate"].rgb())
+    exposure = display_exposure(build.photographs["plate"].rgb())
     return {
         "figures": [
             fig.photo(
@@ -319,7 +319,7 @@ def reflectance_part(build: Build) -> dict[str, Any]:
 
 def render_part(build: Build) -> dict[str, Any]:
     """Model with and without objects, their difference, and the objects alone."""
-    layers, exposure = build.layers, auto_exposure(build.photographs["plate"].rgb())
+    layers, exposure = build.layers, display_exposure(build.photographs["plate"].rgb())
     if not (layers["influence"] > 0).any():
         return {}
     small = {name: pictures.shrink(layers.rgb(name), WIDTH) for name in ("with", "without", "obj")}
