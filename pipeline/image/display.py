@@ -62,7 +62,7 @@ def display_exposure(rgb: np.ndarray) -> float:
 
 
 def _exposure(rgb: np.ndarray, quantile: float, target: float) -> float:
-    luminance = rgb.reshape(-1, 3) @ AP1_LUMINANCE
+    luminance = colour.luminance(rgb.reshape(-1, 3))
     luminance = luminance[np.isfinite(luminance) & (luminance > 0)]
     return float(np.log2(target / np.quantile(luminance, quantile))) if luminance.size else 0.0
 

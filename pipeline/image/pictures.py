@@ -10,7 +10,7 @@ import io
 
 import numpy as np
 
-from pipeline.image.display import DISPLAY, VIEW, display_exposure, display_transform
+from pipeline.image.display import DISPLAY, VIEW, auto_exposure, display_transform
 
 # Perceptually even ramps as nine sRGB stops each, of our own making: lightness rises by equal steps (tested).
 HEAT = np.array([
@@ -35,7 +35,7 @@ def shrink(picture: np.ndarray, width: int) -> np.ndarray:
 def thumbnail(rgb: np.ndarray, width: int = 560, exposure_ev: float | None = None) -> np.ndarray:
     """Display picture (h, w, 3) of ACEScg (H, W, 3) about ``width`` wide; exposed by its own median unless given."""
     small = shrink(rgb, width)
-    exposure = display_exposure(small) if exposure_ev is None else exposure_ev
+    exposure = auto_exposure(small) if exposure_ev is None else exposure_ev
     return display_transform(small, DISPLAY, VIEW, exposure)
 
 
