@@ -8,6 +8,7 @@ cover get more samples. Limits: one plane as local scene, distant light.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from pipeline.light.environment import irradiance
 from pipeline.light.sampling import bilinear, planes
 from pipeline.run import artifacts as A
 from pipeline.run.errors import ManifestError
+from pipeline.run.progress import report
 from pipeline.run.stage import Stage
 from pipeline.transport.denoise import bounding_window, denoise
 from pipeline.transport.difference import difference_block
@@ -70,11 +72,18 @@ def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any],
     return shapes, warnings
 
 
+def tell(what: str) -> Callable[[float], None]:
+    """A progress callback that names its task."""
+    return lambda share: report(what, share)
+
+
 def find_region(worlds: Worlds, rays: Rays, shape: tuple[int, int], light: np.ndarray, params: knobs.Render) -> Region:
     """What to leave, interpolate and trace; the reference strategy interpolates nothing."""
     index, grid = cell_pixels(*shape)
     samples = max(64, PILOT_SHARE * params.samples)
-    pilot = trace(difference_block, worlds, rays[index], samples, params.depth, params.seed + 1, CELL)
+    pilot = trace(
+        difference_block, worlds, rays[index], samples, params.depth, params.seed + 1, CELL, tell("render: pilot")
+    )
     region = plan(pilot, grid, shape, light, params.threshold)
     return replace(region, traced=region.weight > 0) if params.strategy == "reference" else region
 
@@ -118,11 +127,21 @@ def interpolated(region: Region, pixels: np.ndarray, albedo: np.ndarray, light: 
 def trace_region(worlds: Worlds, rays: Rays, params: knobs.Render) -> Samples:
     """The pixels of the region, then those that show an object again with more samples, merged by sample count."""
     strategy = STRATEGIES[params.strategy]
-    first = trace(strategy, worlds, rays, params.samples, params.depth, params.seed + 2)
+    first = trace(
+        strategy, worlds, rays, params.samples, params.depth, params.seed + 2, progress=tell("render: shadows")
+    )
     shown = np.flatnonzero(first.alpha > 0)
     if not len(shown):
         return first
-    again = trace(strategy, worlds, rays[shown], params.samples * OBJECT_BOOST, params.depth, params.seed + 3)
+    again = trace(
+        strategy,
+        worlds,
+        rays[shown],
+        params.samples * OBJECT_BOOST,
+        params.depth,
+        params.seed + 3,
+        progress=tell("render: objects"),
+    )
     return first.merged(shown, again, OBJECT_BOOST / (1 + OBJECT_BOOST))
 
 

@@ -184,6 +184,7 @@ def with_build(args: argparse.Namespace) -> int:
         return 0
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
     from pipeline.run.derive import print_summary
+    from pipeline.run.progress import show_on_terminal
     from pipeline.run.runner import Build
     from stages.order import graph
 
@@ -195,6 +196,7 @@ def with_build(args: argparse.Namespace) -> int:
         problems = build.verify()
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
+    show_on_terminal()
     stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
     build.run_all(stages, lambda name, outcome, seconds: say(f"{name:<12} {outcome:<6} {seconds:7.2f} s"))
     if args.verb == "run" and last == stage_names()[-1]:
