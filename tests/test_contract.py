@@ -46,7 +46,12 @@ BRIDGES = {
     "tifffile": {"pipeline/image/raw.py"},
     "imagecodecs": {"pipeline/simulation/dng.py"},
     "OpenEXR": {"pipeline/run/formats.py"},
-    "PIL": {"pipeline/run/formats.py", "pipeline/image/pictures.py", "pipeline/simulation/capture.py"},
+    "PIL": {
+        "pipeline/run/formats.py",
+        "pipeline/run/figures.py",
+        "pipeline/image/pictures.py",
+        "pipeline/simulation/capture.py",
+    },
     "PyOpenColorIO": {"pipeline/image/display.py"},
     "colour": set(),  # its matrices are constants here, tested against it
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
