@@ -66,7 +66,8 @@ LIGHT = {"numpy", "pydantic", "pipeline", "stages"}
 # Import name -> name in pyproject.toml, where they differ.
 DISTRIBUTIONS = {
     "cv2": "opencv-contrib-python-headless", "drjit": "mitsuba", "PIL": "pillow", "PyOpenColorIO": "opencolorio",
-    "colour": "colour-science", "colour_demosaicing": "colour-demosaicing", "flip_evaluator": "flip-evaluator", "mitsuba_oidn": "mitsuba-oidn",
+    "colour": "colour-science", "colour_demosaicing": "colour-demosaicing", "flip_evaluator": "flip-evaluator",
+    "mitsuba_oidn": "mitsuba-oidn",
     "skimage": "scikit-image",
 }  # fmt: skip
 
