@@ -61,6 +61,7 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@for q in $(QUALITIES); do $(INSITU) run sample_captures/desk --quality $$q --out build/figures/desk_$$q; done
 	@for q in $(if $(findstring kitchen,$(FIGURES)),$(QUALITIES)); do \
 		$(INSITU) run tests/kitchen_table --quality $$q --out build/figures/kitchen_table_$$q; done
+	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
 verify: $(READY)  ## recompute the digests of a build

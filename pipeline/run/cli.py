@@ -62,6 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     simulate = verb("simulate", closure.summary("stages.simulate"), capture=False)
     simulate.add_argument("scene", type=Path, help="SCENE.toml")
     simulate.add_argument("folder", type=Path, help="folder of the new capture")
+    simulate.add_argument("--spectral", action="store_true", help="no capture: compare RGB with spectra on this scene")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
@@ -75,6 +76,9 @@ def _scoring(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--composite", type=Path, help="score this EXR instead of the build's composite")
     sub.add_argument("--plate", type=Path, help="the developed plate that belongs to it (default: the build's)")
     sub.add_argument("--probe", type=Path, help="score this lat-long EXR too")
+    sub.add_argument(
+        "--with-truth", metavar="NAMES", help="put truth in place of camera,pose,probe,albedo: where error is"
+    )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -100,6 +104,12 @@ def say(text: str, stream: Any = None) -> None:
 
 def dispatch(args: argparse.Namespace) -> int:
     """Do what was asked."""
+    if args.verb == "simulate" and args.spectral:
+        from pipeline.simulation.spectral import twin
+
+        twin(args.scene, args.folder, say)
+        say((args.folder / "spectral.md").read_text())
+        return 0
     if args.verb == "simulate":
         from stages.simulate import simulate
 
@@ -184,6 +194,7 @@ def with_build(args: argparse.Namespace) -> int:
         return 0
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
     from pipeline.run.derive import print_summary
+    from pipeline.run.formats import write_bytes
     from pipeline.run.progress import show_on_terminal
     from pipeline.run.runner import Build
     from stages.order import graph
@@ -197,6 +208,13 @@ def with_build(args: argparse.Namespace) -> int:
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
     show_on_terminal()
+    if getattr(args, "with_truth", None):
+        from pipeline.run.substitution import FIGURES, waterfall
+
+        say(f"{'truth in place of':<32}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
+        found = waterfall(build, [name.strip() for name in args.with_truth.split(",")], say)
+        write_bytes(out / "waterfall.json", json.dumps(found, indent=1).encode() + b"\n")
+        return 0
     stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
     build.run_all(stages, lambda name, outcome, seconds: say(f"{name:<12} {outcome:<6} {seconds:7.2f} s"))
     if args.verb == "run" and last == stage_names()[-1]:

@@ -45,6 +45,7 @@ def read_build(folder: Path) -> dict[str, Any]:
         "seconds": sum(record["seconds"] for record in records),
         "cpu": sum(record["cpu_seconds"] for record in records),
         "stages": {record["stage"]: record for record in records},
+        "waterfall": json.loads(path.read_bytes()) if (path := folder / "waterfall.json").exists() else {},
     }
 
 
@@ -76,7 +77,23 @@ def page(folders: list[Path], cores: int, stages: tuple[str, ...]) -> str:
     for stage in stages:
         cells = [f"{b['stages'][stage]['seconds']:.2f}" if stage in b["stages"] else "-" for b in builds]
         lines.append(f"| {stage} | " + " | ".join(cells) + " |")
+    for build in builds:
+        if build["waterfall"]:
+            lines += _waterfall(build)
     return "\n".join(lines)
+
+
+def _waterfall(build: dict[str, Any]) -> list[str]:
+    keys = list(build["waterfall"]["nothing"])
+    lines = ["", f"## Where the error comes from: {build['name']}, {build['quality']}", ""]
+    lines += ["The truth put in place of what a stage estimated (`insitu evaluate --with-truth`).", ""]
+    lines += [
+        "| truth in place of | " + " | ".join(COLUMNS[key] for key in keys) + " |",
+        "|---" * (len(keys) + 1) + "|",
+    ]
+    for label, errors in build["waterfall"].items():
+        lines.append(f"| {label} | " + " | ".join(_cell(errors[key]) for key in keys) + " |")
+    return lines
 
 
 def write_picture(folder: Path, path: Path, width: int = 1600) -> None:

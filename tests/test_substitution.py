@@ -1,0 +1,45 @@
+"""Truth in place of a stage: what is refused, and that it lowers the error it should."""
+
+import numpy as np
+import pytest
+from command import DESK
+
+from pipeline.image.truth import Truth
+from pipeline.run import settings
+from pipeline.run.errors import ManifestError
+from pipeline.run.runner import Build
+from pipeline.run.substitution import true_environment, waterfall
+from pipeline.types import Raster
+from stages.knobs import KNOBS
+from stages.order import graph
+
+
+def built(out) -> Build:
+    return Build(graph(), out, settings.load(out), KNOBS)
+
+
+def test_unknown_names_are_refused(desk_build):
+    with pytest.raises(ManifestError, match="lens"):
+        waterfall(built(desk_build), ["lens"], str)
+
+
+def test_environment_is_turned_and_scaled():
+    """A map whose centre looks along +X of the world, under a rotation; the plate's unit is twice the truth's."""
+    light = np.zeros((8, 16, 3), np.float32)
+    light[4, 8] = 1.0  # along +Z of the map
+    world_from_map = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)  # +Z of the map is +X of the world
+    plate = np.full((12, 12, 3), 0.5)
+    truth = Truth(plate, plate, {}, environment=light, world_from_map=world_from_map)
+    values = {"photographs": {"plate": Raster(Raster.split(2 * plate), "acescg")}}
+    found = true_environment(values, truth)["R"]
+    assert np.unravel_index(found.argmax(), found.shape) == (4, 4)  # u = 1/4 is +X
+    assert found.max() == pytest.approx(2.0, rel=0.02)  # the lookup rounds positions to 1/32 texel
+
+
+@pytest.mark.slow
+def test_true_light_lowers_the_error_of_the_desk(desk_build):
+    assert DESK.exists()
+    found = waterfall(built(desk_build), ["probe", "camera", "pose", "albedo"], str)
+    everything = next(errors for label, errors in found.items() if "+" in label)
+    assert everything["object_rel_err"] < 0.8 * found["nothing"]["object_rel_err"]
+    assert everything["shadow_change_err"] <= 0.04
