@@ -8,12 +8,12 @@ passes through as arrays (`raw`), never through its colour conversions.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from pipeline.conventions import latlong_directions
-from pipeline.image.colour import convert
+from pipeline.image.colour import Space, convert
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Plane
@@ -67,9 +67,7 @@ def scalar_texture(mi: Any, value: float, texture: np.ndarray | None) -> Any:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
-def material_bsdf(
-    mi: Any, material: Material, space: Literal["linear_rec709", "acescg"] = "linear_rec709"
-) -> dict[str, Any]:
+def material_bsdf(mi: Any, material: Material, space: Space = "linear_rec709") -> dict[str, Any]:
     """Mitsuba description of a metallic-roughness material whose colours are linear in ``space``."""
     color = np.asarray(material.base_color, float)
     if material.base_texture is not None:
