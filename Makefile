@@ -54,6 +54,11 @@ check: $(READY)  ## lint and type check
 docs: $(READY)  ## regenerate stages/README.md
 	@$(INSITU) docs > stages/README.md
 
+SIMULATED ?= sample_captures/scenes/desk.toml
+TO ?= build/simulated/$(basename $(notdir $(SIMULATED)))
+simulate: $(READY)  ## make a capture with known truth from the scene SIMULATED, in the folder TO
+	@$(INSITU) simulate $(SIMULATED) $(TO)
+
 QUALITIES := final preview draft
 FIGURES := $(addprefix build/figures/desk_,$(QUALITIES)) $(if $(wildcard $(INSITU_DATA)/captures/kitchen_table),$(addprefix build/figures/kitchen_table_,$(QUALITIES)))
 
@@ -75,4 +80,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: simulate help setup demo all test test-all check docs figures verify lock clean FORCE

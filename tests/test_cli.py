@@ -340,3 +340,9 @@ def test_nothing_is_written_into_the_capture(desk_build):
     listing = {path.name for path in DESK.iterdir()}
     assert not listing & {"build", "settings.json", *NAMES}
     assert os.access(desk_build / "report/report.html", os.R_OK)
+
+
+def test_evaluate_takes_the_capture_either_way():
+    refused = command("evaluate")
+    assert refused.returncode == 2
+    assert "--capture" in refused.stderr

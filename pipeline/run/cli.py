@@ -39,7 +39,8 @@ def build_parser() -> argparse.ArgumentParser:
     def verb(name: str, text: str, capture: bool = True) -> argparse.ArgumentParser:
         sub = verbs.add_parser(name, help=text, description=text)
         if capture:
-            sub.add_argument("capture", type=Path, help="capture folder, or its capture.toml")
+            either = "?" if name == "evaluate" else None  # evaluate also takes --capture, as scoring scripts write it
+            sub.add_argument("capture", type=Path, nargs=either, help="capture folder, or its capture.toml")
             sub.add_argument("--out", type=Path, help="build folder (default: build/<capture name>)")
         return sub
 
@@ -104,6 +105,10 @@ def say(text: str, stream: Any = None) -> None:
 
 def dispatch(args: argparse.Namespace) -> int:
     """Do what was asked."""
+    if args.verb == "evaluate":
+        args.capture = args.capture or args.capture_option
+        if args.capture is None:
+            raise ManifestError("evaluate: no capture; expected a capture folder as argument or --capture")
     if args.verb == "simulate" and args.spectral:
         from pipeline.simulation.spectral import twin
 
