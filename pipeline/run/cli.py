@@ -77,6 +77,7 @@ def _scoring(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--composite", type=Path, help="score this EXR instead of the build's composite")
     sub.add_argument("--plate", type=Path, help="the developed plate that belongs to it (default: the build's)")
     sub.add_argument("--probe", type=Path, help="score this lat-long EXR too")
+    sub.add_argument("--capture", dest="capture_option", type=Path, help="the capture, instead of the argument")
     sub.add_argument(
         "--with-truth", metavar="NAMES", help="put truth in place of camera,pose,probe,albedo: where error is"
     )
