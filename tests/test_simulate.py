@@ -21,8 +21,11 @@ from pipeline.run.formats import digest, read_exr
 from pipeline.run.manifest import SceneWishes, load_capture, load_toml
 from pipeline.simulation import capture, light, sensor, shapes, surfaces
 from pipeline.simulation.lens import Lens, aim, blur, look_at
+from pipeline.simulation.photograph import Measure, camera_rays, path_radiance, picture, surface_albedo
 from pipeline.simulation.scene_file import LampFacts, LightFacts, SimulatedScene, TableFacts, load_scene
-from stages.simulate import board_pose, box_mean, grow, simulate
+from pipeline.simulation.world import Place
+from pipeline.transport.variant import use_mitsuba
+from stages.simulate import Studio, board_pose, box_mean, grow, resampled_change, shadow_pixels, simulate
 
 LENS = Lens(1024, 768, 1150.0, 1151.2, 515.3, 381.6, (-0.081, 0.021, 0.0006, -0.0004, 0.001))
 DESK = Path("sample_captures/scenes/desk.toml")
@@ -234,6 +237,10 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
     assert "did you mean read_noise_e" in message
     assert "camera.width" in message
     assert len(caught.value.problems) == 3  # unknown, missing, odd
+    for change in ("1024", "8000"):  # fewer than region; no whole passes
+        bad.write_text(text.replace("change = 8192", f"change = {change}"))
+        with pytest.raises(ManifestError, match=f"change is {change}; expected 0, or whole passes"):
+            load_scene(bad)
 
 
 # ---------------------------------------------------------------- whole captures
@@ -248,7 +255,8 @@ def tiny_toml(folder: Path, **changes: str) -> Path:
         "fy = 1151.2": "fy = 107.9",
         "cx = 515.3": "cx = 48.3", "cy = 381.6": "cy = 35.8", "texel_m = 0.0005": "texel_m = 0.01",
         "plate_ev = [-2, 0, 2]": "plate_ev = [0]", "ball_frames = 6": "ball_frames = 2", "plate = 256": "plate = 4",
-        "region = 4096": "region = 8", "object = 20480": "object = 8", "region_pass = 1024": "region_pass = 4",
+        "region = 4096": "region = 8", "change = 8192": "change = 8", "object = 20480": "object = 8",
+        "region_pass = 1024": "region_pass = 4",
         "ball = 256": "ball = 4", "calibration = 64": "calibration = 4", "environment = 256": "environment = 4",
         "depth = 10": "depth = 4", "environment_width = 512": "environment_width = 32",
         "wall_azimuth_deg = 250.0": "wall_azimuth_deg = 250.0\nmap_width = 128",
@@ -290,7 +298,7 @@ def test_truth_is_complete_and_consistent(tiny: Path) -> None:
         assert np.isfinite(raster.rgb()).all()
     coverage = read_exr(tiny / "truth" / truth["coverage"])
     assert set(coverage.channels) == {"vase", "red_sphere", "gold_ring"}
-    assert sum(coverage.channels.values()).max() <= 1 + 1e-3  # half floats
+    assert np.sum(list(coverage.channels.values()), 0).max() <= 1 + 1e-3  # half floats
     plate, filled = (read_exr(tiny / "truth" / truth[name]).rgb() for name in ("plate", "with_objects"))
     assert np.abs(filled - plate)[sum(coverage.channels.values()) > 0.99].mean() > 1
     environment = read_exr(tiny / "truth" / truth["environment"]["file"], "acescg")
@@ -333,12 +341,62 @@ def test_same_seed_same_bytes(tiny: Path, tmp_path: Path) -> None:
         simulate(tiny_toml(tmp_path), again, lambda _: None)
 
 
+def test_more_samples_of_the_change_leave_the_photographs_alone(tiny: Path, tmp_path: Path) -> None:
+    """Only the truth's uncovered shadows differ from a capture without them; they can be added to one, bit for bit."""
+    plain = tmp_path / "capture"
+    simulate(tiny_toml(tmp_path, **{"change = 8192": "change = 0"}), plain, lambda _: None)
+    studio, worlds = tiny_worlds(tmp_path)
+    names = sorted(str(path.relative_to(tiny)) for path in tiny.rglob("*") if path.is_file())
+    differ = [name for name in names if digest(tiny / name) != digest(plain / name)]
+    assert differ == ["truth/truth.json", "truth/with_objects.exr"]
+    finer, old = (read_exr(f / "truth" / "with_objects.exr").rgb().astype(float) for f in (tiny, plain))
+    plate = read_exr(tiny / "truth" / "plate.exr").rgb().astype(float)
+    covered = np.sum(list(read_exr(tiny / "truth" / "coverage.exr").channels.values()), 0) > 0
+    moved = (finer != old).any(-1)
+    assert moved.any()
+    assert not moved[covered].any()
+    assert (shadow_pixels(old, plate, covered.astype(float)) >= moved).all()
+    noise, before = (json.loads((f / "truth" / "truth.json").read_text())["noise"] for f in (tiny, plain))
+    assert noise["spp_change"] == 8
+    assert noise["object_median_rel"] == before["object_median_rel"]
+    assert noise["shadow_median_rel"] > 0
+    coverage = np.sum(list(read_exr(plain / "truth" / "coverage.exr").channels.values()), 0)
+    added, found = resampled_change(studio, worlds, {"plate": plate, "with_objects": old}, coverage, lambda _: None)
+    assert np.array_equal(added.astype(np.float16), finer)
+    assert before | found == noise
+
+
+def tiny_worlds(folder: Path, **changes: str) -> tuple[Studio, tuple[Measure, Measure]]:
+    """The tiny scene's plate with and without objects."""
+    mi, scene = use_mitsuba(), load_scene(tiny_toml(folder, **changes))
+    studio = Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera))
+    people, objects = studio.place.photographer(studio.pose(scene.plate)), studio.place.objects()
+    filled, plate = (
+        path_radiance(mi, studio.place.load(*p), scene.sampling.depth) for p in ((people, objects), (people,))
+    )
+    return studio, (filled, plate)
+
+
+def test_resampled_change_is_that_of_path_tracing(tmp_path: Path) -> None:
+    """Given pictures that are wrong by a known change everywhere, the new samples bring the path-traced change."""
+    studio, worlds = tiny_worlds(tmp_path, **{"change = 8192": "change = 32"})
+    rays = camera_rays(studio.mi, studio.lens, studio.pose(studio.scene.plate))
+    filled, plate = (picture(studio.mi, rays, world, (72, 96), 64, 64, 7) for world in worlds)
+    coverage = np.zeros((72, 96))
+    wrong = {"plate": 0 * plate + 64.0, "with_objects": 0 * plate + 32.0}  # half floats hold both exactly
+    truth, found = resampled_change(studio, worlds, wrong, coverage, lambda _: None)
+    assert found["spp_change"] == 32
+    share = 32 / (32 + 8)
+    new = (truth - 32.0) / share - 32.0
+    error = (new - blur(filled - plate, studio.scene.camera.blur_sigma_px)).mean(-1)
+    # the blur over three pixels doubles the error of the mean at most
+    assert abs(error.mean()) < 4 * 2 * error.std() / np.sqrt(error.size)
+    assert np.abs(new.mean()) > 10 * 2 * error.std() / np.sqrt(error.size)  # so that the line above says something
+
+
 def test_board_is_not_mirrored_and_lies_where_the_pose_says() -> None:
     """OpenCV finds the print in the rendered plate, and its corners fall where pose and lens put them."""
     cv2 = pytest.importorskip("cv2")
-    from pipeline.simulation.photograph import camera_rays, path_radiance, picture
-    from pipeline.simulation.world import Place
-    from pipeline.transport.variant import use_mitsuba
 
     mi, scene = use_mitsuba(), desk_scene()
     flat = scene.model_copy(
@@ -363,9 +421,6 @@ def test_board_is_not_mirrored_and_lies_where_the_pose_says() -> None:
 
 def test_white_furnace_shows_the_albedo() -> None:
     """Under a constant room of radiance one a flat diffuse table has the radiance of its albedo, everywhere."""
-    from pipeline.simulation.photograph import camera_rays, path_radiance, picture, surface_albedo
-    from pipeline.simulation.world import Place
-    from pipeline.transport.variant import use_mitsuba
 
     mi, scene = use_mitsuba(), desk_scene()
     flat = scene.model_copy(

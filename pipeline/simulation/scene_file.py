@@ -179,6 +179,7 @@ class SamplingFacts(Strict):
     pass_samples: int = Field(64, ge=1, description="samples per pixel of one pass")
     plate: int = Field(256, ge=1)
     region: int = Field(4096, ge=1, description="where the objects change the plate")
+    change: int = Field(0, ge=0, description="of the change, added in the shadows; 0, or at least as many as region")
     object: int = Field(16384, ge=1, description="where the objects are seen")
     region_pass: int = Field(1024, ge=1, description="samples per pixel of one pass in region and object")
     region_threshold: float = Field(0.01, gt=0, description="relative change that puts a pixel into the region")
@@ -187,6 +188,15 @@ class SamplingFacts(Strict):
     environment: int = Field(64, ge=1)
     environment_width: int = Field(512, ge=16)
     depth: int = Field(10, ge=2)
+
+    @model_validator(mode="after")
+    def _whole_passes(self) -> SamplingFacts:
+        if self.change and (self.change < max(self.region, 2 * self.region_pass) or self.change % self.region_pass):
+            raise ValueError(
+                f"change is {self.change}; expected 0, or whole passes of region_pass ({self.region_pass}), "
+                f"at least two and at least region ({self.region})"
+            )
+        return self
 
 
 class SimulatedScene(Strict):
