@@ -50,13 +50,13 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
 
 
 def method_of(view: str, asked: Method) -> Method:
-    """The method for a view: a ball gets a linear one even where the plate gets Menon's.
+    """The method for a view: a ball is always interpolated bilinearly, whatever the plate gets.
 
-    Menon's chooses directions and smooths colour differences, which sharpens texture but tints a lamp a few photosites
-    wide: on the desk capture it moved the light on the walls' sides by up to 5 % in red. Linear kernels keep each
-    channel's sum.
+    Sharper methods borrow from the other channels, which tints a lamp a few photosites wide; bilinear kernels keep each
+    channel's sum. Irradiance of the desk capture over 200 upward normals against truth, root mean square of R, G, B:
+    bilinear 0.5, 0.7, 1.0 %; Malvar 0.6, 0.9, 1.2 %; Menon moved red by up to 5 %.
     """
-    return "malvar" if asked == "menon" and view != "plate" else asked
+    return asked if view == "plate" else "bilinear"
 
 
 def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:
