@@ -12,6 +12,7 @@ Imports nothing that estimates. Limits: the room is infinitely far away, no dept
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ from pipeline.simulation.photograph import (
     trace,
 )
 from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts, load_scene
+from pipeline.simulation.spectral import Size, main, twin
 from pipeline.simulation.world import Place
 
 HELP = "Make a capture with known truth from SCENE.toml into the folder OUT."
@@ -316,3 +318,16 @@ def box_mean(values: np.ndarray, half: int = 2) -> np.ndarray:
 def grow(mask: np.ndarray) -> np.ndarray:
     """The mask and what lies within REGION_GROWTH pixels of it."""
     return box_mean(mask.astype(float), REGION_GROWTH) > 0.5 / (2 * REGION_GROWTH + 1) ** 2
+
+
+def simulate_spectral(
+    scene_toml: Path, out: Path, progress: Callable[[str], None], size: Size | None = None
+) -> dict[str, Any]:
+    """Compare RGB with spectra on ``scene_toml``: spectral.json, spectral.md and pictures in ``out``; no capture."""
+    return twin(scene_toml, out, progress, __name__, size)
+
+
+if __name__ == "__main__":  # the process that simulate_spectral starts: Mitsuba's variant is global
+    from pipeline.transport.variant import switch_to
+
+    sys.exit(main(sys.argv[1:], switch_to))

@@ -40,6 +40,7 @@ BRIDGES = {
         "pipeline/transport/materials.py",
         "pipeline/transport/trace.py",
         "pipeline/simulation/photograph.py",
+        "pipeline/simulation/twin_world.py",
     },
     "pycolmap": {"pipeline/camera/colmap_bridge.py"},
     "rawpy": {"pipeline/image/raw.py"},
@@ -53,7 +54,7 @@ BRIDGES = {
         "pipeline/simulation/capture.py",
     },
     "PyOpenColorIO": {"pipeline/image/display.py"},
-    "colour": set(),  # its matrices are constants here, tested against it
+    "colour": {"pipeline/simulation/spectra.py"},  # spectra; its matrices are constants here, tested against it
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
     "flip_evaluator": {"pipeline/image/metrics.py"},
     "skimage": {"pipeline/image/metrics.py"},

@@ -12,9 +12,10 @@ from pipeline.run.cli import build_parser
 from pipeline.run.errors import ManifestError
 from pipeline.run.formats import read_exr
 from pipeline.simulation import spectra
-from pipeline.simulation.spectral import FURNACE, Size, twin
+from pipeline.simulation.spectral import FURNACE, Size
 from pipeline.simulation.twin_report import compare, markdown
 from pipeline.simulation.twin_world import grey, wavelength_table
+from stages.simulate import simulate_spectral
 
 DESK = Path(__file__).parents[1] / "sample_captures/scenes/desk.toml"
 CAMERA = spectra.CAMERAS[0]
@@ -142,7 +143,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("twin") / "out"
     mi = use_mitsuba()
     before, lines = mi.variant(), []
-    twin(DESK, out, lines.append, Size(64, 48, 16, 2, 32))
+    simulate_spectral(DESK, out, lines.append, Size(64, 48, 16, 2, 32))
     assert mi.variant() == before
     assert "comparing" in lines
     return out
@@ -183,5 +184,5 @@ def test_lamps_keep_their_edges(tiny: Path) -> None:
 
 def test_refusals(tiny: Path) -> None:
     with pytest.raises(ManifestError, match="not empty"):
-        twin(DESK, tiny, lambda _: None)
+        simulate_spectral(DESK, tiny, lambda _: None)
     assert build_parser().parse_args(["simulate", "a.toml", "b", "--spectral"]).spectral

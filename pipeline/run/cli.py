@@ -111,9 +111,9 @@ def dispatch(args: argparse.Namespace) -> int:
         if args.capture is None:
             raise ManifestError("evaluate: no capture; expected a capture folder as argument or --capture")
     if args.verb == "simulate" and args.spectral:
-        from pipeline.simulation.spectral import twin
+        from stages.simulate import simulate_spectral
 
-        twin(args.scene, args.folder, say)
+        simulate_spectral(args.scene, args.folder, say)
         say((args.folder / "spectral.md").read_text())
         return 0
     if args.verb == "simulate":

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -47,6 +46,7 @@ from pipeline.simulation.twin_world import (
     table_white,
 )
 
+MitsubaIn = Callable[[str], Any]  # "spectral" or "rgb" -> mitsuba in that variant, with insitu's material
 SEEDS = (1, 2)  # of the halves, whose difference is the noise
 FURNACE = ("grey 18 %", "white, glossy", "white, metal", "red patch")
 
@@ -62,16 +62,19 @@ class Size:
     environment_width: int = 64
 
 
-def twin(scene_toml: Path, out: Path, progress: Callable[[str], None], size: Size | None = None) -> dict[str, Any]:
-    """Render both worlds of ``scene_toml`` into ``out``, in another process; returns what spectral.json holds.
+def twin(
+    scene_toml: Path, out: Path, progress: Callable[[str], None], worker: str, size: Size | None = None
+) -> dict[str, Any]:
+    """Render both worlds of ``scene_toml`` into ``out``; returns what spectral.json holds.
 
-    Raises ManifestError for a bad scene file or a folder that is not empty, ToolError when Mitsuba cannot run.
+    ``worker`` is the module that calls ``main`` in a process of its own. Raises ManifestError for a bad scene file or
+    a folder that is not empty, ToolError when Mitsuba cannot run.
     """
     load_scene(scene_toml)
     if out.exists() and any(out.iterdir()):
         raise ManifestError(f"{out}: is not empty; the spectral twin is written into a new folder")
     numbers = [str(value) for value in astuple(size or Size())]
-    command = [sys.executable, "-m", __name__, str(scene_toml.resolve()), str(out.resolve()), *numbers]
+    command = [sys.executable, "-m", worker, str(scene_toml.resolve()), str(out.resolve()), *numbers]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
         last = "it said nothing"
@@ -82,33 +85,6 @@ def twin(scene_toml: Path, out: Path, progress: Callable[[str], None], size: Siz
         raise ToolError(f"spectral twin: stopped with {process.returncode}: {last}; run insitu doctor")
     record: dict[str, Any] = json.loads((out / "spectral.json").read_text())
     return record
-
-
-# ---------------------------------------------------------------- Mitsuba
-
-
-def mitsuba_in(kind: str) -> Any:
-    """Mitsuba in its ``spectral`` or ``rgb`` variant, with insitu's material. For this module's own process only."""
-    from pipeline.transport.materials import register
-    from pipeline.transport.variant import LLVM_VARIABLE, bundled_llvm, candidates
-
-    if (library := bundled_llvm()) is not None:
-        os.environ.setdefault(LLVM_VARIABLE, str(library))
-    import mitsuba as mi
-
-    reasons = []
-    for name in candidates():
-        if name.startswith("scalar"):
-            continue
-        try:
-            mi.set_variant(name.replace("rgb", kind))
-        except (ImportError, RuntimeError) as error:
-            reasons.append(f"{name}: {error}")
-            continue
-        register(mi)
-        mi.set_log_level(mi.LogLevel.Error)
-        return mi
-    raise ToolError(f"spectral twin: no {kind} variant of Mitsuba loads; {'; '.join(reasons)}; run insitu doctor")
 
 
 def view_of(scene: SimulatedScene, size: Size) -> tuple[Lens, np.ndarray]:
@@ -209,7 +185,7 @@ def developed(
     return total
 
 
-def make(scene_toml: Path, out: Path, size: Size, say: Callable[[str], None]) -> None:
+def make(scene_toml: Path, out: Path, size: Size, say: Callable[[str], None], mitsuba_in: MitsubaIn) -> None:
     """Both worlds, the comparison, and its files. Sets Mitsuba's variant."""
     scene, camera = dim(load_scene(scene_toml)), spectra.camera_of(spectra.CAMERAS[0])
     lens, pose = view_of(scene, size)
@@ -266,7 +242,7 @@ def head(
     }
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str], mitsuba_in: MitsubaIn) -> int:
     """Run in a process of its own; the last line tells what went wrong."""
     parser = argparse.ArgumentParser()
     parser.add_argument("scene", type=Path)
@@ -279,12 +255,8 @@ def main(argv: list[str]) -> int:
         sys.stdout.flush()
 
     try:
-        make(args.scene, args.out, Size(*args.numbers), say)
+        make(args.scene, args.out, Size(*args.numbers), say, mitsuba_in)
     except InsituError as error:
         say(str(error))
         return error.exit_code
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

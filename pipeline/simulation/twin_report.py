@@ -132,7 +132,7 @@ spectra. Made by one command, figures and text:
 Camera: {record["camera"]}, its 3x3 matrix fitted to ISO 17321-1 under D65.
 Picture: {width} x {height} pixels about the objects, {record["paths_per_pixel"]} paths each,
 {record["wavelengths_per_path"]} wavelengths per path. Objects and their measured spectra: {made_of}.
-The main window is {record["window"]}, the rest of the room D65 times smooth spectra; the columns differ in what the lamps are.
+The main window is {record["window"]}, the rest of the room D65 times smooth spectra; the columns are kinds of lamps.
 
 RGB lights are what camera and matrix make of the spectra, RGB surfaces what they make of them under D65. Figures are
 median / 95 %; in brackets what noise alone would give. Beside the page: `spectral.json` and the pictures as EXR.

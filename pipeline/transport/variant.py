@@ -55,3 +55,28 @@ def use_mitsuba() -> Any:
         mi.set_log_level(mi.LogLevel.Error)
         return mi
     raise ToolError("mitsuba: no variant loads; " + "; ".join(reasons) + "; run insitu doctor")
+
+
+def switch_to(kind: str) -> Any:
+    """Mitsuba in its ``spectral`` or ``rgb`` variant of the best backend; later calls switch the whole process.
+
+    For a process of its own: whoever else uses Mitsuba in it would find another variant. Raises ToolError without LLVM
+    and CUDA.
+    """
+    if (library := bundled_llvm()) is not None:
+        os.environ.setdefault(LLVM_VARIABLE, str(library))
+    import mitsuba as mi
+
+    reasons = []
+    for variant in (name for name in candidates() if not name.startswith("scalar")):
+        try:
+            mi.set_variant(variant.replace("rgb", kind))
+        except (ImportError, RuntimeError) as error:
+            reasons.append(f"{variant}: {error}")
+            continue
+        from pipeline.transport.materials import register
+
+        register(mi)
+        mi.set_log_level(mi.LogLevel.Error)
+        return mi
+    raise ToolError(f"mitsuba: no {kind} variant with LLVM or CUDA loads; {'; '.join(reasons)}; run insitu doctor")
