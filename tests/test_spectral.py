@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.run.cli import build_parser
-from pipeline.run.errors import ManifestError
+from pipeline.run.errors import ManifestError, ToolError
 from pipeline.run.formats import read_exr
 from pipeline.simulation import spectra
 from pipeline.simulation.spectral import FURNACE, Size
@@ -182,7 +182,10 @@ def test_lamps_keep_their_edges(tiny: Path) -> None:
     assert np.allclose(seen.mean((0, 1)) / rgb.mean((0, 1)), 1, atol=5e-3)
 
 
-def test_refusals(tiny: Path) -> None:
+def test_refusals(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ManifestError, match="not empty"):
         simulate_spectral(DESK, tiny, lambda _: None)
     assert build_parser().parse_args(["simulate", "a.toml", "b", "--spectral"]).spectral
+    monkeypatch.setenv("INSITU_VARIANT", "scalar_rgb")
+    with pytest.raises(ToolError, match="no spectral variant.*only scalar_rgb.*doctor"):
+        simulate_spectral(DESK, tmp_path / "new", lambda _: None, Size(16, 12, 1, 1, 8))

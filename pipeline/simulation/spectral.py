@@ -19,6 +19,7 @@ import argparse
 import json
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -75,14 +76,18 @@ def twin(
         raise ManifestError(f"{out}: is not empty; the spectral twin is written into a new folder")
     numbers = [str(value) for value in astuple(size or Size())]
     command = [sys.executable, "-m", worker, str(scene_toml.resolve()), str(out.resolve()), *numbers]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+    with (
+        tempfile.TemporaryFile("w+") as complaints,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=complaints, text=True) as process,
+    ):
         assert process.stdout is not None
-        last = "it said nothing"
         for line in process.stdout:
-            last = line.strip() or last
-            progress(last)
-    if process.returncode:
-        raise ToolError(f"spectral twin: stopped with {process.returncode}: {last}; run insitu doctor")
+            progress(line.rstrip())
+        code = process.wait()
+        complaints.seek(0)
+        said = complaints.read().strip().splitlines()
+    if code:
+        raise ToolError(f"spectral twin: {said[-1] if said else f'exit code {code}, run insitu doctor'}")
     record: dict[str, Any] = json.loads((out / "spectral.json").read_text())
     return record
 
@@ -243,7 +248,7 @@ def head(
 
 
 def main(argv: list[str], mitsuba_in: MitsubaIn) -> int:
-    """Run in a process of its own; the last line tells what went wrong."""
+    """Run in a process of its own; the last line on stderr tells what went wrong."""
     parser = argparse.ArgumentParser()
     parser.add_argument("scene", type=Path)
     parser.add_argument("out", type=Path)
@@ -257,6 +262,6 @@ def main(argv: list[str], mitsuba_in: MitsubaIn) -> int:
     try:
         make(args.scene, args.out, Size(*args.numbers), say, mitsuba_in)
     except InsituError as error:
-        say(str(error))
+        sys.stderr.write(f"{error}\n")
         return error.exit_code
     return 0

@@ -79,4 +79,5 @@ def switch_to(kind: str) -> Any:
         register(mi)
         mi.set_log_level(mi.LogLevel.Error)
         return mi
-    raise ToolError(f"mitsuba: no {kind} variant with LLVM or CUDA loads; {'; '.join(reasons)}; run insitu doctor")
+    found = "; ".join(reasons) or f"only {', '.join(candidates())} may be tried"
+    raise ToolError(f"mitsuba: no {kind} variant with LLVM or CUDA loads; {found}; run insitu doctor")
