@@ -142,7 +142,8 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     out = tmp_path_factory.mktemp("twin") / "out"
     mi = use_mitsuba()
-    before, lines = mi.variant(), []
+    before = mi.variant()
+    lines: list[str] = []
     simulate_spectral(DESK, out, lines.append, Size(64, 48, 16, 2, 32))
     assert mi.variant() == before
     assert "comparing" in lines
@@ -187,5 +188,5 @@ def test_refusals(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         simulate_spectral(DESK, tiny, lambda _: None)
     assert build_parser().parse_args(["simulate", "a.toml", "b", "--spectral"]).spectral
     monkeypatch.setenv("INSITU_VARIANT", "scalar_rgb")
-    with pytest.raises(ToolError, match="no spectral variant.*only scalar_rgb.*doctor"):
+    with pytest.raises(ToolError, match=r"no spectral variant.*only scalar_rgb.*doctor"):
         simulate_spectral(DESK, tmp_path / "new", lambda _: None, Size(16, 12, 1, 1, 8))
