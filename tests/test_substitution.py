@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from command import DESK
+from command import DESK, command
 
 from pipeline.image.truth import Truth
 from pipeline.run import settings
@@ -37,9 +37,11 @@ def test_environment_is_turned_and_scaled():
 
 
 @pytest.mark.slow
-def test_true_light_lowers_the_error_of_the_desk(desk_build):
-    assert DESK.exists()
-    found = waterfall(built(desk_build), ["probe", "camera", "pose", "albedo"], str)
+def test_true_light_lowers_the_error_of_the_desk(tmp_path):
+    """At preview, where noise is no longer the largest term: measured 0.70 of the error, shadow 0.019."""
+    done = command("run", DESK, "--out", tmp_path / "out", "--quality", "preview")
+    assert done.returncode == 0, done.stderr
+    found = waterfall(built(tmp_path / "out"), ["probe", "camera", "pose", "albedo"], str)
     everything = next(errors for label, errors in found.items() if "+" in label)
     assert everything["object_rel_err"] < 0.8 * found["nothing"]["object_rel_err"]
     assert everything["shadow_change_err"] <= 0.04
