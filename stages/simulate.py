@@ -39,7 +39,6 @@ from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts
 from pipeline.simulation.spectral import Size, main, twin
 from pipeline.simulation.world import Place
 
-HELP = "Make a capture with known truth from SCENE.toml into the folder OUT."
 SMOOTHING_PX = 5.0  # of the light that the ball throws
 REGION_GROWTH = 3  # pixels added round the region that gets more samples
 CHANGE_SEED = 80_000

@@ -246,3 +246,17 @@ def test_no_path_of_a_machine_is_written_down():
 def test_nothing_built_is_tracked():
     for path in tracked():
         assert not {"build", ".venv", "__pycache__"} & set(path.relative_to(ROOT).parts), path
+
+
+def test_readme_shows_what_the_figures_say():
+    """The errors printed in the README are those of the desk at preview in the generated page of figures."""
+    rows = [line.split("|")[1:-1] for line in (ROOT / "docs/figures.md").read_text().splitlines() if "|" in line]
+    rows = [[cell.strip() for cell in row] for row in rows]
+    names = next(row for row in rows if row[0] == "capture")
+    ours, nothing = (
+        dict(zip(names, next(row for row in rows if row[:2] == ["desk", quality])))
+        for quality in ("preview", "*doing nothing*")
+    )
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert f"object, relative error {ours['object']} {nothing['object']}" in text
+    assert f"shadow, error of the change {ours['shadow change']} {nothing['shadow change']}" in text

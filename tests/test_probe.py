@@ -12,7 +12,7 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
 from pipeline.light import mirror_ball, sphere_fit
 from pipeline.light.combine import ViewMap, fill, merge, relative_exposure, toward_photographer
-from pipeline.light.environment import AXES, downsample, irradiance, resize_environment, total_energy
+from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
 from stages import knobs, probe
@@ -52,7 +52,7 @@ def facts(*balls: tuple[str, bool]) -> dict[str, Any]:
 def truth_map(place: Place, height: int, width: int, split: int = 4) -> np.ndarray:
     w = latlong_directions(height * split, width * split).reshape(-1, 3)
     rgb = place.radiance(np.broadcast_to(place.ball, w.shape), w).reshape(height * split, width * split, 3)
-    return downsample(rgb, split)
+    return resize_environment(rgb, height, width)
 
 
 # ---- geometry ------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.camera.lens import distort, unproject
+from pipeline.conventions import WORLD_FROM_MARKER, transform_points
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera
 
@@ -49,7 +50,8 @@ def tone(radiance: np.ndarray, curve: str = "gamma") -> np.ndarray:
 
 def marker_points(side_m: float) -> np.ndarray:
     """Corners (4, 3) of a single marker in the world, in ArUco's order: the first is at -x, -z."""
-    return (np.stack([SQUARE[:, 0], np.zeros(4), SQUARE[:, 1]], -1) - (0.5, 0, 0.5)) * side_m
+    right, up = SQUARE[:, 0] - 0.5, 0.5 - SQUARE[:, 1]
+    return transform_points(WORLD_FROM_MARKER, np.stack([right, up, np.zeros(4)], -1) * side_m)
 
 
 def bilinear(picture: np.ndarray, px: np.ndarray) -> np.ndarray:

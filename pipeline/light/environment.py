@@ -74,14 +74,6 @@ def _overlap(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     return shared / shared.sum(1, keepdims=True)
 
 
-def downsample(rgb: np.ndarray, factor: int) -> np.ndarray:
-    """Map (H/factor, W/factor, C) that keeps the integral over the sphere; ``factor`` must divide both sizes."""
-    height, width = rgb.shape[:2]
-    if height % factor or width % factor:
-        raise ValueError(f"downsample: {width} x {height} is not divisible by {factor}")
-    return resize_environment(rgb, height // factor, width // factor)
-
-
 def total_energy(rgb: np.ndarray) -> np.ndarray:
     """Integral of radiance over the sphere, (C,)."""
     return np.einsum("hw,hwc->c", latlong_solid_angles(*rgb.shape[:2]), np.asarray(rgb, float))

@@ -30,11 +30,6 @@ def sh9_of_environment(rgb: np.ndarray) -> np.ndarray:
     return weighted.reshape(-1, 9).T @ np.asarray(rgb, float).reshape(height * width, -1)
 
 
-def sh9_radiance(coefficients: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Radiance (..., C) of coefficients (9, C) at unit directions (..., 3); it may be negative."""
-    return sh9_basis(directions) @ coefficients
-
-
 def sh9_irradiance(coefficients: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Irradiance (N, C) at unit normals (N, 3) from coefficients (9, C)."""
     return (sh9_basis(normals) * _COSINE_LOBE) @ coefficients

@@ -62,7 +62,7 @@ def page(folders: list[Path], cores: int, stages: tuple[str, ...]) -> str:
         cells = [_cell(build["metrics"].get(key)) for key in COLUMNS]
         time = f"{build['seconds']:.1f} ({build['cpu']:.1f})"
         lines.append(f"| {build['name']} | {build['quality']} | " + " | ".join([*cells, time]) + " |")
-    for build in builds:
+    for build in sorted(builds, key=lambda build: build["quality"] != "preview"):  # the demo's quality first
         if build["name"] not in nothing_shown and build["metrics"]:
             nothing_shown.add(build["name"])
             cells = [_cell(build["metrics"]["do_nothing"].get(key)) for key in COLUMNS]
