@@ -28,7 +28,8 @@ from pipeline.transport.denoise import bounding_window, denoise
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.region import CELL, Region, cell_pixels, plan
-from pipeline.transport.scene import Worlds, build_worlds, material_bsdf, mesh_shape
+from pipeline.transport.scene import Worlds, build_worlds
+from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, Samples, Strategy, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Raster, Result, View

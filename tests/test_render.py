@@ -9,7 +9,8 @@ from pipeline.conventions import HALF_PIXEL, invert_rigid, transform_points
 from pipeline.light.environment import irradiance
 from pipeline.transport.difference import difference_block
 from pipeline.transport.region import CELL, cell_pixels, interpolate, plan
-from pipeline.transport.scene import build_worlds, material_bsdf, mesh_shape
+from pipeline.transport.scene import build_worlds
+from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Raster

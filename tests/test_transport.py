@@ -10,7 +10,8 @@ from pipeline.transport import differential
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.reflectance import fill_unseen, reflected_radiance, updated_brdf
-from pipeline.transport.scene import Worlds, build_worlds, envmap_grid, material_bsdf, mesh_shape
+from pipeline.transport.scene import Worlds, build_worlds, envmap_grid
+from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane

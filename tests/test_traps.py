@@ -20,7 +20,8 @@ from pipeline.run.formats import read_exr, write_exr
 from pipeline.simulation.dng import DngFacts, dng_bytes
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
-from pipeline.transport.scene import build_worlds, environment_emitter, material_bsdf, mesh_shape
+from pipeline.transport.scene import build_worlds, environment_emitter
+from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, Samples, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Raster
