@@ -16,6 +16,11 @@ Array = Annotated[
     BeforeValidator(lambda value: np.asarray(value, float)),
     PlainSerializer(lambda value: value.tolist(), return_type=list),
 ]
+Indices = Annotated[
+    np.ndarray,
+    BeforeValidator(lambda value: np.asarray(value, int)),
+    PlainSerializer(lambda value: value.tolist(), return_type=list),
+]
 
 
 class Record(BaseModel):
@@ -141,6 +146,36 @@ class Plane(Record):
     corners_m: Array  # (4, 3) counter-clockwise seen from outside
     source: str
     contact_sigma_px: float = 0.0
+
+
+class Proxy(Record):
+    """A further real surface of the local scene: it receives shadows and light, casts them, and stays the plate's."""
+
+    name: str
+    vertices_m: Array  # (N, 3), world frame
+    faces: Indices  # (M, 3), counter-clockwise seen from outside
+    albedo: Array | None = None  # (3,), ACEScg; None: to be measured from the plate
+
+
+class Occluder(Record):
+    """A real thing in front of the inserted objects: a mesh, or a mask picture of the plate's size. One of them."""
+
+    name: str
+    vertices_m: Array | None = None  # (N, 3), world frame
+    faces: Indices | None = None  # (M, 3)
+    mask_file: str | None = None  # absolute path of a PNG or EXR; 1 in front, 0 not; `formats.read_mask` reads it
+    mask_sha256: str = ""
+
+
+class Emitter(Record):
+    """A compact light: an exact set of texels of the environment. What no emitter holds is the sky."""
+
+    name: str  # "sun", "lamp_1", ... by falling irradiance
+    direction: Array  # (3,), unit, world frame: towards the light, mean weighted by irradiance
+    solid_angle_sr: float  # of its texels
+    half_angle_rad: float  # of the uniform disc of the same spread
+    irradiance: Array  # (3,), at normal incidence, ACEScg: integral of radiance over the texels
+    texels: Indices  # (N,), flat indices (row * width + column) into the environment, ascending
 
 
 @dataclass(frozen=True)

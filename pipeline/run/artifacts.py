@@ -6,12 +6,14 @@ from typing import Any
 
 from pipeline.conventions import ACESCG, CAMERA_RGB, RADIANCE_UNIT
 from pipeline.run.stage import Artifact
-from pipeline.types import BallFit, Bracket, Camera, Plane, View
+from pipeline.types import BallFit, Bracket, Camera, Emitter, Occluder, Plane, Proxy, View
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
 BRACKETS = Artifact("brackets", "json", "every RAW file by view, with its metadata", type=dict[str, Bracket])
 BOARD_PHOTOS = Artifact("board_photos", "json", "calibration photographs: file, sha256", type=list[dict[str, str]])
+PROXIES = Artifact("proxies", "json", "further real surfaces of the local scene: meshes, albedo", "m", type=list[Proxy])
+OCCLUDERS = Artifact("occluders", "json", "real things before the objects: meshes or masks", "m", type=list[Occluder])
 
 MOSAICS = Artifact(
     "mosaics",
@@ -38,6 +40,13 @@ ENVIRONMENT = Artifact(
     "world-oriented lat-long at the ball: R G B, variance.RGB, seen (0..1)",
     RADIANCE_UNIT,
     ACESCG,
+)
+EMITTERS = Artifact(
+    "emitters",
+    "json",
+    "compact lights as sets of texels of the environment, strongest first; the other texels are the sky",
+    RADIANCE_UNIT,
+    type=list[Emitter],
 )
 
 PLANE = Artifact("plane", "json", "plane of the local scene and its modelled rectangle", "m", type=Plane)
