@@ -6,7 +6,7 @@ Small records are pydantic models (validated, written as JSON, arrays as lists);
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
@@ -146,6 +146,16 @@ class Plane(Record):
     corners_m: Array  # (4, 3) counter-clockwise seen from outside
     source: str
     contact_sigma_px: float = 0.0
+
+
+class Surface(Record):
+    """How the plane reflects besides its albedo, with the held-out scores that decided (see stages/reflectance.py)."""
+
+    model: Literal["diffuse", "rough", "metallic"] = "diffuse"
+    roughness: float = 1.0  # glTF: alpha = roughness^2
+    f0: float = 0.04  # reflectance of the dielectric lobe at normal incidence
+    metallic: float = 0.0
+    scores: list[dict[str, Any]] = []  # one row per rung of the ladder
 
 
 class Proxy(Record):
