@@ -1,11 +1,14 @@
 """The glTF 2.0 metallic-roughness material as a Mitsuba BSDF, exactly as appendix B of the specification.
 
-    dielectric = mix(base / pi, D V, F),  F = 0.04 + 0.96 (1 - |v.h|)^5
+    dielectric = mix(base / pi, D V, F),  F = f0 + (1 - f0) (1 - |v.h|)^5
     metal      = D V (base + (1 - base) (1 - |v.h|)^5)
     material   = mix(dielectric, metal, metallic)
 
-D is Trowbridge-Reitz with alpha = roughness^2, V the separable Smith term. Mitsuba's own ``principled`` is another
-model (a white furnace differs by 6 %). Both sides of a face are lit, as in offline renderers. ``alpha`` >= 1e-3.
+D is Trowbridge-Reitz with alpha = roughness^2, V the separable Smith term. ``f0``, the reflectance of the dielectric at
+normal incidence, is 0.04 unless KHR_materials_ior or KHR_materials_specular say otherwise. Mitsuba's own ``principled``
+is another model (a white furnace differs by 6 %). The specification's mix is reciprocal, and keeps the energy of metals
+and of dielectrics seen from above; a smooth white dielectric near grazing angles gives back more than it gets (20 % at
+a cosine of 0.2 and roughness 0.3). Both sides of a face are lit, as in offline renderers. ``alpha`` >= 1e-3.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ MIN_ALPHA = 1e-3
 
 
 def register(mi: Any) -> None:
-    """Register ``insitu_gltf`` (base_color, metallic, roughness: textures or numbers) for the current variant."""
+    """Register ``insitu_gltf`` (base_color, metallic, roughness, f0: textures or numbers) for the current variant."""
     import drjit as dr
 
     def schlick(cosine: Any) -> Any:
@@ -31,22 +34,23 @@ def register(mi: Any) -> None:
             self.base = props.get_texture("base_color", 0.8)
             self.metallic = props.get_texture("metallic", 0.0)
             self.roughness = props.get_texture("roughness", 0.5)
+            self.f0 = props.get_texture("f0", DIELECTRIC_F0)
             side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [mi.BSDFFlags.DiffuseReflection | side, mi.BSDFFlags.GlossyReflection | side]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def traverse(self, callback: Any) -> None:
-            for name in ("base", "metallic", "roughness"):
+            for name in ("base", "metallic", "roughness", "f0"):
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
-        def _parameters(self, si: Any, active: Any) -> tuple[Any, Any, Any]:
+        def _parameters(self, si: Any, active: Any) -> tuple[Any, Any, Any, Any]:
             metallic = self.metallic.eval_1(si, active)
             alpha = dr.maximum(dr.square(self.roughness.eval_1(si, active)), MIN_ALPHA)
-            return self.base.eval(si, active), metallic, alpha
+            return self.base.eval(si, active), metallic, alpha, self.f0.eval_1(si, active)
 
         @staticmethod
-        def _glossy_share(base: Any, metallic: Any, cos_i: Any) -> Any:
-            fresnel = DIELECTRIC_F0 + (1 - DIELECTRIC_F0) * schlick(cos_i)
+        def _glossy_share(base: Any, metallic: Any, f0: Any, cos_i: Any) -> Any:
+            fresnel = f0 + (1 - f0) * schlick(cos_i)
             diffuse = (1 - metallic) * (1 - fresnel) * dr.mean(base)
             glossy = metallic * dr.maximum(dr.mean(base), 0.1) + (1 - metallic) * fresnel
             return dr.clip(glossy / (glossy + diffuse + 1e-8), 0.05, 1.0 - 0.05 * (1 - metallic))
@@ -58,28 +62,28 @@ def register(mi: Any) -> None:
 
         def _value_and_pdf(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             wi, wo = self._flip(si.wi, wo)
-            base, metallic, alpha = self._parameters(si, active)
+            base, metallic, alpha, f0 = self._parameters(si, active)
             active = active & (wi.z > 0) & (wo.z > 0)
             half = dr.normalize(wi + wo)
             lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             d = lobe.eval(half)
             glossy = d * lobe.smith_g1(wi, half) * lobe.smith_g1(wo, half) / (4 * wi.z)  # times cos(wo)
             edge = schlick(dr.dot(wi, half))
-            fresnel = DIELECTRIC_F0 + (1 - DIELECTRIC_F0) * edge
+            fresnel = f0 + (1 - f0) * edge
             diffuse = base * (dr.inv_pi * wo.z)
             dielectric = diffuse * (1 - fresnel) + glossy * fresnel
             metal = glossy * (base + (1 - base) * edge)
             value = dielectric * (1 - metallic) + metal * metallic
-            share = self._glossy_share(base, metallic, wi.z)
+            share = self._glossy_share(base, metallic, f0, wi.z)
             pdf_glossy = lobe.pdf(wi, half) / (4 * dr.dot(wo, half))
             pdf = share * pdf_glossy + (1 - share) * dr.inv_pi * wo.z
             return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            base, metallic, alpha = self._parameters(si, active)
+            base, metallic, alpha, f0 = self._parameters(si, active)
             sign = dr.sign(si.wi.z)
             wi = mi.Vector3f(si.wi.x, si.wi.y, si.wi.z * sign)
-            share = self._glossy_share(base, metallic, wi.z)
+            share = self._glossy_share(base, metallic, f0, wi.z)
             take_glossy = sample1 < share
             lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             half, _ = lobe.sample(wi, sample2)
