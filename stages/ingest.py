@@ -6,6 +6,7 @@ the one stage that looks outside the build, so it is asked at every run.
 
 Frames of a view are sorted by exposure (label), then by name, so the order of the listing never matters; a file given
 twice (same content) counts once. An exposure that EXIF lacks must be stated in [[exposure]]; it is never invented.
+Proxies and mesh occluders become triangles in the world frame here; a mask occluder is named by path and digest.
 
 Limits: Bayer RAW of one camera; every view has the plate's size.
 """
@@ -19,19 +20,25 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
+from pipeline.image.colour import convert
 from pipeline.image.exposure import exposure_of
 from pipeline.image.raw import file_sha256, read_metadata
-from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, WISHES
-from pipeline.run.errors import CaptureError, ManifestError
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
+from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
+from pipeline.run.formats import read_mask
 from pipeline.run.manifest import CaptureFacts, SceneWishes, load_capture, load_toml, problems_of, resolve_files
 from pipeline.run.stage import Stage
-from pipeline.transport.meshes import refuse_undecodable
-from pipeline.types import Bracket, Frame, Result
+from pipeline.transport.meshes import load_meshes, refuse_undecodable
+from pipeline.transport.proxies import box, join
+from pipeline.types import Bracket, Frame, Occluder, Proxy, Result
 from stages import knobs
 
 OBJECT_SUFFIXES = (".glb", ".obj", ".ply")
+MASK_SUFFIXES = (".png", ".exr")
+FAR_M = 100.0  # a local scene that reaches farther is in another unit
 DEFAULT_SCENE = "scene.toml"
 
 
@@ -49,6 +56,8 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     board = _board_photos(facts, root, manifest, problems)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
+    proxies = _proxies(facts, root, manifest, problems, warnings)
+    occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
     if problems:
         raise ManifestError(*problems, *flaws)
     if flaws:
@@ -57,10 +66,15 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
         "frames": {name: len(bracket.frames) for name, bracket in brackets.items()},
         "board_photos": len(board),
         "objects": len(wishes["object"]),
-        "size_px": [brackets["plate"].frames[0].width, brackets["plate"].frames[0].height],
+        "proxies": len(proxies),
+        "occluders": len(occluders),
+        "size_px": _size(brackets),
         "camera": brackets["plate"].frames[0].camera,
     }
-    outputs = {"facts": dumped, "wishes": wishes, "brackets": brackets, "board_photos": board}
+    outputs = {
+        "facts": dumped, "wishes": wishes, "brackets": brackets, "board_photos": board, "proxies": proxies,
+        "occluders": occluders,
+    }  # fmt: skip
     return Result(outputs, numbers, warnings)
 
 
@@ -75,19 +89,13 @@ def _wishes(scene: Path | None, root: Path, problems: list[str]) -> dict[str, An
     dumped = wishes.model_dump(mode="json")
     for number, wish in enumerate(dumped["object"]):
         where = f"{scene}: object[{number}].file"
-        folders = [scene.parent, root] if scene else [root]
-        file = Path(os.path.expandvars(wish["file"]))
-        found = next((folder / file for folder in folders if (folder / file).is_file()), None)
-        if file.suffix.lower() not in OBJECT_SUFFIXES:
-            problems.append(f"{where}: is {wish['file']!r}; expected a .glb, .obj or .ply file")
-        elif found is None:
-            problems.append(f"{where}: is {wish['file']!r}; no such file in {' or '.join(map(str, folders))}")
-        else:
+        found = _found(wish["file"], [scene.parent, root] if scene else [root], where, OBJECT_SUFFIXES, problems)
+        if found is not None:
             try:
                 refuse_undecodable(found)
             except ManifestError as error:
                 problems.append(f"{where}: {error}")
-            wish |= {"path": str(found.resolve()), "sha256": file_sha256(found)}
+            wish |= {"path": str(found), "sha256": file_sha256(found)}
     return dumped
 
 
@@ -95,6 +103,83 @@ def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: lis
     files, found = resolve_files(facts.camera.calibration, root, f"{manifest}: camera.calibration")
     problems.extend(found)
     return [{"file": file.relative_to(root).as_posix(), "sha256": file_sha256(file)} for file in files]
+
+
+def _proxies(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], warnings: list[str]) -> list[Proxy]:
+    """Boxes and mesh files as triangles in the world frame, albedo in ACEScg."""
+    proxies = []
+    for number, table in enumerate(facts.proxy):
+        if table.file:
+            where = f"{manifest}: proxy[{number}].file"
+            path = _found(table.file, [manifest.parent, root], where, OBJECT_SUFFIXES, problems)
+            triangles = _triangles(path, where, problems, warnings) if path else None
+        elif table.centre_m and table.size_m:
+            triangles = box(table.centre_m, table.size_m, table.yaw_deg)
+        if triangles is not None:
+            albedo = None if table.albedo is None else convert(np.array(table.albedo), table.albedo_space, "acescg")
+            proxies.append(Proxy(name=table.name, vertices_m=triangles[0], faces=triangles[1], albedo=albedo))
+    return proxies
+
+
+def _occluders(
+    facts: CaptureFacts, root: Path, manifest: Path, size_px: list[int], problems: list[str], warnings: list[str]
+) -> list[Occluder]:
+    """Meshes as triangles in the world frame; masks as the path and digest of a picture of the plate's size."""
+    occluders = []
+    for number, table in enumerate(facts.occluder):
+        where = f"{manifest}: occluder[{number}].file"
+        path = _found(table.file, [manifest.parent, root], where, OBJECT_SUFFIXES + MASK_SUFFIXES, problems)
+        if path is None:
+            continue
+        if path.suffix.lower() in OBJECT_SUFFIXES:
+            if triangles := _triangles(path, where, problems, warnings):
+                occluders.append(Occluder(name=table.name, vertices_m=triangles[0], faces=triangles[1]))
+            continue
+        try:
+            height, width = read_mask(path).shape
+        except ArtifactError as error:
+            problems.append(f"{where}: {error}")
+            continue
+        if size_px and [width, height] != size_px:
+            problems.append(f"{where}: is {width} x {height}; expected the plate's {size_px[0]} x {size_px[1]}")
+        else:
+            occluders.append(Occluder(name=table.name, mask_file=str(path), mask_sha256=file_sha256(path)))
+    return occluders
+
+
+def _found(name: str, folders: list[Path], where: str, suffixes: tuple[str, ...], problems: list[str]) -> Path | None:
+    """The file in the first folder that has it, resolved; None and a problem when its kind or place is wrong."""
+    file = Path(os.path.expandvars(name))
+    path = next((folder / file for folder in folders if (folder / file).is_file()), None)
+    if file.suffix.lower() not in suffixes:
+        problems.append(f"{where}: is {name!r}; expected a {', '.join(suffixes[:-1])} or {suffixes[-1]} file")
+    elif path is None:
+        problems.append(f"{where}: is {name!r}; no such file in {' or '.join(map(str, dict.fromkeys(folders)))}")
+    else:
+        return path.resolve()
+    return None
+
+
+def _triangles(
+    path: Path, where: str, problems: list[str], warnings: list[str]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices and faces of a mesh file in the world frame; None and a problem when it cannot be read."""
+    try:
+        meshes, said = load_meshes(path)
+    except ManifestError as error:
+        problems.append(f"{where}: {error}")
+        return None
+    vertices, faces = join(meshes)
+    warnings.extend(text for text in said if "not modelled" not in text)  # only the shape of its materials is used
+    farthest = float(np.abs(vertices).max())
+    if farthest > FAR_M:
+        warnings.append(f"{path.name}: reaches {farthest:.0f} m from the origin: is the file in metres, world frame?")
+    return vertices, faces
+
+
+def _size(brackets: dict[str, Bracket]) -> list[int]:
+    """Width and height of the plate [px]; empty when none of its frames could be read."""
+    return [size for frame in brackets["plate"].frames[:1] for size in (frame.width, frame.height)]
 
 
 def _truth(facts: CaptureFacts, manifest: Path, problems: list[str]) -> dict[str, str]:
@@ -195,6 +280,9 @@ STAGE = Stage(
     compute,
     knobs.Ingest,
     inputs={},
-    outputs={"facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS},
+    outputs={
+        "facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS, "proxies": PROXIES,
+        "occluders": OCCLUDERS,
+    },
     impure=True,
-)
+)  # fmt: skip

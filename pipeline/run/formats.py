@@ -120,12 +120,39 @@ def write_png(path: Path, picture: np.ndarray) -> None:
 
 def read_png(path: Path) -> np.ndarray:
     """(H, W, C) or (H, W) as stored, 8 or 16 bit."""
+    picture = _decode(path)
+    return picture if picture.ndim == 2 else np.ascontiguousarray(picture[..., 2::-1])
+
+
+def _decode(path: Path) -> np.ndarray:
+    """Picture as stored, its colours in OpenCV's order: (H, W), or (H, W, 3 or 4) as B G R A."""
     import cv2
 
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise ArtifactError(f"{path}: not a readable picture")
-    return picture if picture.ndim == 2 else np.ascontiguousarray(picture[..., 2::-1])
+    return picture
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Coverage (H, W) float32 in [0, 1] of a mask picture, .png (8 or 16 bit) or .exr: 1 in front, 0 not.
+
+    Grey, or a colour picture whose channels agree; an alpha of 1 throughout says nothing and is dropped. Raises
+    ArtifactError when the picture cannot be read, is ambiguous, or leaves [0, 1].
+    """
+    if path.suffix.lower() == ".exr":
+        named = read_exr(path).channels
+    else:
+        stored = _decode(path)
+        planes = np.atleast_3d(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
+        named = {name: planes[..., i] for i, name in enumerate("BGRA"[: planes.shape[-1]])}
+    layers = [layer for name, layer in named.items() if name != "A" or len(named) == 1 or np.any(layer != 1)]
+    mask = np.asarray(layers[0], np.float32)
+    if any(not np.array_equal(layer, layers[0]) for layer in layers):
+        raise ArtifactError(f"{path}: its {len(layers)} channels differ; expected a grey picture; save one channel")
+    if not (np.isfinite(mask).all() and mask.min() >= 0 and mask.max() <= 1):
+        raise ArtifactError(f"{path}: values from {mask.min():.3g} to {mask.max():.3g}; expected 0 to 1")
+    return mask
 
 
 def write(folder: Path, artifact: Artifact, value: Any) -> Path:

@@ -10,7 +10,7 @@ import os
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -18,6 +18,9 @@ from pipeline.run.errors import ManifestError
 
 Rgb = tuple[float, float, float]
 Matrix4 = list[list[float]]
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Strict(BaseModel):
@@ -100,6 +103,34 @@ class ExposureFacts(Strict):
     fnumber: float | None = Field(None, gt=0)
 
 
+class ProxyFacts(Strict):
+    """A further real surface near the objects: a box, or a mesh file in the world frame, metres."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    file: str | None = Field(None, description=".glb, .obj or .ply; relative to capture.toml, else to root")
+    centre_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(None, description="of a box, world frame")
+    size_m: tuple[Length, Length, Length] | None = Field(None, description="of a box along its x, y, z")
+    yaw_deg: float = Field(0.0, description="of a box about +Y, counter-clockwise seen from above")
+    albedo: tuple[Share, Share, Share] | None = Field(None, description="linear; without it, measured from the plate")
+    albedo_space: Literal["linear_rec709", "acescg"] = "linear_rec709"
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> ProxyFacts:
+        box = [self.centre_m is not None, self.size_m is not None]
+        if not ((self.file and not any(box)) or (not self.file and all(box))):
+            raise ValueError("expected either file, or centre_m with size_m")
+        if self.file and self.yaw_deg:
+            raise ValueError("yaw_deg turns a box; a mesh file is in the world frame already")
+        return self
+
+
+class OccluderFacts(Strict):
+    """A real thing in front of the objects: a mesh file in the world frame, or a mask picture of the plate."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    file: str = Field(description="mesh .glb .obj .ply, or mask .png .exr (1 = in front); relative to capture.toml")
+
+
 class CaptureFacts(Strict):
     """capture.toml."""
 
@@ -113,6 +144,8 @@ class CaptureFacts(Strict):
     camera: CameraFacts = CameraFacts()
     pose: list[PoseFacts] = []
     exposure: list[ExposureFacts] = []
+    proxy: list[ProxyFacts] = []
+    occluder: list[OccluderFacts] = []
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
 
     @model_validator(mode="after")
@@ -127,6 +160,10 @@ class CaptureFacts(Strict):
         twice = sorted({pose.view for pose in self.pose if [other.view for other in self.pose].count(pose.view) > 1})
         if twice:
             raise ValueError(f"pose.view {twice} has several [[pose]] tables; expected one per view")
+        for kind, tables in (("proxy", self.proxy), ("occluder", self.occluder)):
+            given = [table.name for table in tables]
+            if len(set(given)) < len(given):
+                raise ValueError(f"{kind} names are {given}; each must be unique")
         if not self.camera.calibration and self.camera.given is None:
             raise ValueError("camera: neither calibration photographs nor given numbers")
         if self.camera.calibration and self.board is None:
