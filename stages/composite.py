@@ -82,4 +82,5 @@ STAGE = Stage(
     knobs.Composite,
     inputs={"photographs": A.PHOTOGRAPHS, "layers": A.LAYERS},
     outputs={"composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY},
+    live=True,
 )

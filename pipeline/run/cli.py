@@ -201,7 +201,7 @@ def with_build(args: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
     from pipeline.run.derive import print_summary
     from pipeline.run.formats import write_bytes
-    from pipeline.run.progress import show_on_terminal
+    from pipeline.run.progress import shown
     from pipeline.run.runner import Build
     from stages.order import graph
 
@@ -213,7 +213,6 @@ def with_build(args: argparse.Namespace) -> int:
         problems = build.verify()
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
-    show_on_terminal()
     if getattr(args, "with_truth", None):
         from pipeline.run.substitution import FIGURES, waterfall
 
@@ -222,7 +221,13 @@ def with_build(args: argparse.Namespace) -> int:
         write_bytes(out / "waterfall.json", json.dumps(found, indent=1).encode() + b"\n")
         return 0
     stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
-    build.run_all(stages, lambda name, outcome, seconds: say(f"{name:<12} {outcome:<6} {seconds:7.2f} s"))
+
+    def tell(name: str, outcome: str, seconds: float) -> None:
+        variant = (build.record(name) or {"numbers": {}})["numbers"].get("variant", "")
+        say(f"{name:<12} {outcome:<6} {seconds:7.2f} s  {variant}".rstrip())
+
+    with shown(), build.stop.listening():
+        build.run_all(stages, tell)
     if args.verb == "run" and last == stage_names()[-1]:
         say(print_summary(build))
     return 0

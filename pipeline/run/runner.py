@@ -3,12 +3,17 @@
 Make decides what to ask by time; this decides what to do by digest of inputs, parameters, code and library versions.
 ``record.json`` is removed before the first output is replaced and written last, so an interrupted stage leaves none and
 runs again. Two processes may work on one build: a stage is locked while it runs, its inputs while they are read.
+
+A stage may offer results while it computes (`pipeline.run.progress`): their files, and the pictures that follow live
+from them, replace the old ones without a record. Interrupted, it returns what it has; the record then says incomplete,
+which is good enough for the stages after it and never fresh.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -23,8 +28,9 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from pipeline.run import closure, formats
+from pipeline.run import closure, formats, progress
 from pipeline.run.errors import ArtifactError
+from pipeline.run.live import Live, Stop
 from pipeline.run.settings import Settings
 from pipeline.run.stage import Artifact, Graph, Stage
 from pipeline.types import Raster, Result
@@ -43,6 +49,7 @@ class Build:
     knobs: dict[str, Any]
     memory: dict[str, tuple[str, Any]] = field(default_factory=dict)  # artifact -> its digest and value
     versions: dict[str, str] = field(default_factory=lambda: {n: importlib.metadata.version(n) for n in LIBRARIES})
+    stop: Stop = field(default_factory=Stop)
 
     def record(self, name: str) -> dict[str, Any] | None:
         """The record of a stage, or None when it has not run."""
@@ -101,7 +108,10 @@ class Build:
             yield
 
     def run(self, stage: Stage) -> str:
-        """Run one stage unless its record shows that nothing changed; ``"fresh"``, ``"ran"`` or ``"same"`` (bytes)."""
+        """Run one stage unless its record shows that nothing changed.
+
+        ``"fresh"``, ``"ran"``, ``"same"`` (it ran, to the same bytes), or ``"part"`` (it was interrupted).
+        """
         with self.locked(stage):
             return self._run(stage)
 
@@ -118,28 +128,38 @@ class Build:
             os.utime(self.out / stage.name / "record.json")
             return "fresh"
         start, cpu = time.perf_counter(), time.process_time()
-        result = self._compute(stage)
-        if set(result.outputs) != set(stage.outputs):
-            raise TypeError(
-                f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}"
-            )
-        (self.out / stage.name / "record.json").unlink(missing_ok=True)
+        folder = self.out / stage.name
+        checkpoint = folder / "checkpoint.npz"
+        show = functools.partial(self._show, stage)
+        with progress.hosted(Live(stage.name, self.stop, checkpoint, _digest_of(wanted), show)):
+            try:
+                result = self._compute(stage)
+            finally:
+                self.stop.patient = False
+                progress.report(stage.name, 1.0)
+        values = settled(stage, result)
+        (folder / "record.json").unlink(missing_ok=True)
         outputs = {}
-        for key, artifact in stage.outputs.items():
-            value = settle(artifact, result.outputs[key])
-            outputs[artifact.name] = formats.digest(formats.write(self.out / stage.name, artifact, value))
-            self.memory[artifact.name] = outputs[artifact.name], value
+        for artifact in stage.outputs.values():
+            outputs[artifact.name] = formats.digest(formats.write(folder, artifact, values[artifact.name]))
+            self.memory[artifact.name] = outputs[artifact.name], values[artifact.name]
         seconds = {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
         measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
         changed = old is None or old.get("outputs") != outputs
         record = wanted | {"outputs": outputs} | seconds | measured
-        formats.write_bytes(self.out / stage.name / "record.json", _json(record))
+        formats.write_bytes(folder / "record.json", _json(record))
         for warning in result.warnings:
             log.warning("%s: %s", stage.name, warning)
+        if not is_complete(record):
+            os.utime(folder / "record.json", (0, 0))  # older than all it needs, so that make asks for it again
+            return "part"
+        checkpoint.unlink(missing_ok=True)
         return "ran" if changed else "same"
 
     def _is_fresh(self, stage: Stage, wanted: dict[str, Any], old: dict[str, Any]) -> bool:
         if any(old.get(key) != json.loads(_json(value)) for key, value in wanted.items()):
+            return False
+        if not is_complete(old):
             return False
         return all((self.out / stage.name / artifact.filename).exists() for artifact in stage.outputs.values())
 
@@ -153,6 +173,47 @@ class Build:
             for argument, artifact in stage.inputs.items()
         }
         return stage.compute(**inputs, params=params)
+
+    def _show(self, stage: Stage, result: Result, seen: Callable[[Path], None]) -> None:
+        """Write an offered result, after the pictures that follow live from it; ``seen`` is told of each."""
+        values = settled(stage, result)
+        for follower in self.graph.stages:
+            if follower.live and stage in self.graph.parents(follower):
+                self._follow(follower, stage, values, seen)
+        self._replace(stage, values, seen)
+
+    def _follow(self, follower: Stage, stage: Stage, values: dict[str, Any], seen: Callable[[Path], None]) -> None:
+        """Run a live stage on offered values, unless another input is missing or another process is at work there.
+
+        Locks are only tried, never waited for: ``stage`` is locked already, and may come later in reading order.
+        """
+        others = [parent for parent in self.graph.parents(follower) if parent is not stage]
+        if any(self.record(parent.name) is None for parent in others):
+            return
+        with contextlib.ExitStack() as stack:
+            for other in [*others, follower]:
+                (self.out / other.name).mkdir(exist_ok=True)
+                file = stack.enter_context((self.out / other.name / ".lock").open("w"))
+                try:
+                    fcntl.flock(file, fcntl.LOCK_NB | (fcntl.LOCK_EX if other is follower else fcntl.LOCK_SH))
+                except BlockingIOError:
+                    return
+            inputs = {
+                argument: values[artifact.name] if artifact.name in values else self.value(artifact)
+                for argument, artifact in follower.inputs.items()
+            }
+            params = self.knobs[follower.name].model_validate(self.settings.params[follower.name])
+            with progress.hosted(progress.NOBODY):
+                result = follower.compute(**inputs, params=params)
+            self._replace(follower, settled(follower, result), seen)
+
+    def _replace(self, stage: Stage, values: dict[str, Any], seen: Callable[[Path], None]) -> None:
+        """Write outputs that no record vouches for, pictures first."""
+        (self.out / stage.name / "record.json").unlink(missing_ok=True)
+        for artifact in sorted(stage.outputs.values(), key=lambda artifact: artifact.kind != "picture"):
+            path = formats.write(self.out / stage.name, artifact, values[artifact.name])
+            if artifact.kind == "picture":
+                seen(path)
 
     def run_all(self, stages: Iterable[Stage], report: Callable[[str, str, float], None]) -> None:
         """Run stages in order; ``report(name, outcome, seconds)`` after each."""
@@ -176,6 +237,18 @@ class Build:
                 elif formats.digest(path) != record["outputs"][artifact.name]:
                     problems.append(f"{path}: differs from what {stage.name} wrote")
         return problems
+
+
+def is_complete(record: dict[str, Any]) -> bool:
+    """Whether a record is of a stage that was not interrupted."""
+    return (record.get("numbers") or {}).get("complete") is not False
+
+
+def settled(stage: Stage, result: Result) -> dict[str, Any]:
+    """Every output by the name of its artifact, settled. Raises TypeError when they are not those declared."""
+    if set(result.outputs) != set(stage.outputs):
+        raise TypeError(f"{stage.name}: compute returned {sorted(result.outputs)}, declared {sorted(stage.outputs)}")
+    return {artifact.name: settle(artifact, result.outputs[key]) for key, artifact in stage.outputs.items()}
 
 
 def settle(artifact: Artifact, value: Any) -> Any:

@@ -38,6 +38,7 @@ class Stage:
     inputs: dict[str, Artifact]
     outputs: dict[str, Artifact]
     impure: bool = False  # takes (capture_folder, scene_file, params): reads outside the build, so asked every time
+    live: bool = False  # quick, and makes a picture: also run on what an earlier stage offers while it computes
 
 
 class Graph:
