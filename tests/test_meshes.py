@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from pipeline.run.errors import ManifestError
-from pipeline.transport.meshes import load_meshes
+from pipeline.transport.meshes import Material, load_meshes
 
 
 def glb(path: Path, **factors: object) -> Path:
@@ -73,3 +74,48 @@ def test_unreadable_files_are_refused_in_one_line(tmp_path: Path, name: str) -> 
         load_meshes(path)
     assert "\n" not in str(refused.value)
     assert name in str(refused.value)
+
+
+def test_glass_and_light_of_a_gltf_file(tmp_path: Path) -> None:
+    path = glb(tmp_path / "a.glb", baseColorFactor=[1.0, 1.0, 1.0, 1.0])
+
+    def declare(document: dict) -> None:
+        document["materials"][0] |= {
+            "emissiveFactor": [1.0, 0.5, 0.25],
+            "extensions": {
+                "KHR_materials_transmission": {"transmissionFactor": 0.75},
+                "KHR_materials_ior": {"ior": 1.33},
+                "KHR_materials_emissive_strength": {"emissiveStrength": 8.0},
+                "KHR_materials_sheen": {},
+            },
+        }
+        document["extensionsRequired"] = ["KHR_materials_transmission"]
+
+    edit_glb(path, declare)
+    meshes, warnings = load_meshes(path)
+    material = meshes[0].material
+    assert (material.transmission, material.ior) == (0.75, 1.33)
+    assert material.emission == (8.0, 4.0, 2.0)
+    assert len(warnings) == 1
+    assert "KHR_materials_sheen" in warnings[0]
+
+
+def test_emissive_texture_is_decoded(tmp_path: Path) -> None:
+    picture = Image.fromarray(np.full((4, 4, 3), (255, 188, 0), np.uint8))
+    path = glb(tmp_path / "a.glb", emissiveFactor=[1.0, 1.0, 1.0], emissiveTexture=picture)
+    material = load_meshes(path)[0][0].material
+    np.testing.assert_allclose(material.emission_texture[0, 0], [1.0, 0.5029, 0.0], atol=1e-4)
+
+
+def test_materials_of_one_name_are_told(tmp_path: Path) -> None:
+    path = glb(tmp_path / "a.glb")
+    edit_glb(path, lambda document: document["materials"].append({"name": "m"}))
+    assert any("several materials are named 'm'" in warning for warning in load_meshes(path)[1])
+
+
+def test_what_is_not_said_follows_from_the_kind() -> None:
+    assert Material().shown_color == (0.8, 0.8, 0.8)
+    assert Material().shown_roughness == 0.5
+    glass = Material(transmission=1.0)
+    assert (glass.shown_color, glass.shown_roughness) == ((1.0, 1.0, 1.0), 0.0)
+    assert Material((0.1, 0.2, 0.3), 0.0, 0.7, transmission=1.0).shown_roughness == 0.7

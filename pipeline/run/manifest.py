@@ -172,12 +172,26 @@ class CaptureFacts(Strict):
 
 
 class MaterialWish(Strict):
-    """Metallic-roughness material; replaces the file's own. Colours are linear in ``space``."""
+    """Material of an object; replaces the file's own. Colours are linear in ``space``."""
 
-    base_color: Rgb = (0.8, 0.8, 0.8)
+    base_color: Rgb | None = Field(None, description="0.8 grey when not given, clear for glass")
     metallic: float = Field(0.0, ge=0, le=1)
-    roughness: float = Field(0.5, ge=0, le=1)
+    roughness: float | None = Field(None, ge=0, le=1, description="0.5 when not given, 0 for glass")
+    conductor: Literal["aluminium", "brass", "chromium", "copper", "gold", "iron", "silver"] | None = None
+    transmission: float = Field(0.0, ge=0, le=1, description="1 is glass, a thick solid")
+    ior: float = Field(1.5, gt=1, le=4, description="refractive index")
+    emission: Rgb = Field((0.0, 0.0, 0.0), description="1 is the radiance of a white surface lying on the plane")
     space: Literal["linear_rec709", "acescg"] = "linear_rec709"
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> MaterialWish:
+        if self.conductor and (self.base_color or "metallic" in self.model_fields_set):
+            raise ValueError(f"conductor {self.conductor!r} sets base_color and metallic; give one or the other")
+        if self.transmission and (self.conductor or self.metallic):
+            raise ValueError("transmission: a metal lets no light through; give transmission or metal")
+        if min(self.emission) < 0:
+            raise ValueError(f"emission is {self.emission}; expected three numbers >= 0")
+        return self
 
 
 class ObjectWish(Strict):

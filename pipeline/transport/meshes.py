@@ -18,19 +18,40 @@ from pipeline.image.colour import decode_srgb
 from pipeline.run.errors import ManifestError
 
 GLB_MAGIC = b"glTF"
-SUPPORTED_EXTENSIONS = {"KHR_texture_transform", "KHR_materials_ior", "KHR_mesh_quantization"}
+MODELLED_EXTENSIONS = {"KHR_materials_ior", "KHR_materials_transmission", "KHR_materials_emissive_strength"}
+SUPPORTED_EXTENSIONS = {"KHR_texture_transform", "KHR_mesh_quantization"} | MODELLED_EXTENSIONS
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """glTF metallic-roughness. Colours linear Rec.709; textures (H, W, C) linear, first row at v = 1, or None."""
+    """glTF metallic-roughness, glass, metals by name, emission. Colours linear Rec.709, or as who reads them says.
 
-    base_color: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    Textures (H, W, C) are linear, first row at v = 1, or None. What is None follows from the rest: see `shown_color`
+    and `shown_roughness`.
+    """
+
+    base_color: tuple[float, float, float] | None = None
     metallic: float = 0.0
-    roughness: float = 0.5
+    roughness: float | None = None
+    conductor: str | None = None  # a metal of `pipeline.transport.conductors`, in place of colour and metallic
+    transmission: float = 0.0  # share of the light that is not reflected which goes through, as a thick solid
+    ior: float = 1.5
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1 is the radiance of a white surface lying on the plane
     base_texture: np.ndarray | None = None  # (H, W, 3), multiplies base_color
     metallic_texture: np.ndarray | None = None  # (H, W)
     roughness_texture: np.ndarray | None = None  # (H, W)
+    emission_texture: np.ndarray | None = None  # (H, W, 3), multiplies emission
+
+    @property
+    def shown_color(self) -> tuple[float, float, float]:
+        """Base colour: what was given, else clear glass or light grey."""
+        grey = 1.0 if self.transmission else 0.8
+        return self.base_color or (grey, grey, grey)
+
+    @property
+    def shown_roughness(self) -> float:
+        """Roughness: what was given, else polished glass or half rough."""
+        return (0.0 if self.transmission else 0.5) if self.roughness is None else self.roughness
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +63,17 @@ class Mesh:
     normals: np.ndarray
     uv: np.ndarray | None
     material: Material
+
+    def flaw_as_solid(self) -> str:
+        """Why light cannot pass through it as through a solid: a hole, faces turned inwards, or nothing ("")."""
+        _, corner = np.unique(self.vertices, axis=0, return_inverse=True)
+        faces = corner.reshape(-1)[self.faces]
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+        code, other = edges @ [len(self.vertices), 1], edges @ [1, len(self.vertices)]
+        if not np.array_equal(np.sort(code), np.sort(other)):  # every edge is run once each way
+            return "is not closed"
+        a, b, c = (self.vertices[self.faces[:, i]] - self.vertices.mean(0) for i in range(3))
+        return "has its faces turned inwards" if np.einsum("ij,ij->", a, np.cross(b, c)) < 0 else ""
 
 
 def refuse_undecodable(path: Path) -> None:
@@ -88,7 +120,7 @@ def load_meshes(path: Path) -> tuple[list[Mesh], list[str]]:
 
 
 def _glb_materials(path: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
-    """Metallic-roughness factors by material name, as written in the file, and warnings."""
+    """Materials by name, as written in the file, and warnings of what is not modelled."""
     with path.open("rb") as stream:
         head = stream.read(20)
         if len(head) < 20 or head[:4] != GLB_MAGIC:
@@ -101,19 +133,22 @@ def _glb_materials(path: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
     if missing:
         raise ManifestError(f"{path}: needs {', '.join(sorted(missing))}, which is not decoded; export it without")
     warnings = []
-    factors = {}
+    factors: dict[str, dict[str, Any]] = {}
     for material in document.get("materials", []):
-        factors[material.get("name", "")] = material.get("pbrMetallicRoughness", {})
+        name = material.get("name", "")
+        if name in factors:
+            warnings.append(f"{path.name}: several materials are named {name!r}; the last one's numbers hold for all")
+        factors[name] = material
         extra = sorted(
-            {"normalTexture", "emissiveTexture", "occlusionTexture"} & set(material)
-            | set(material.get("extensions", {}))
+            {"normalTexture", "occlusionTexture"} & set(material)
+            | (set(material.get("extensions", {})) - MODELLED_EXTENSIONS)
         )
-        if any(material.get("emissiveFactor", [])):
-            extra.append("emissiveFactor")
+        if "transmissionTexture" in material.get("extensions", {}).get("KHR_materials_transmission", {}):
+            extra.append("transmissionTexture")
         if material.get("alphaMode", "OPAQUE") != "OPAQUE":
             extra.append(f"alphaMode {material['alphaMode']}")
         if extra:
-            warnings.append(f"{path.name}: material {material.get('name', '')!r}: not modelled: {', '.join(extra)}")
+            warnings.append(f"{path.name}: material {name!r}: not modelled: {', '.join(extra)}")
     return factors, warnings
 
 
@@ -141,10 +176,16 @@ def _material(source: Any, factors: dict[str, dict[str, Any]]) -> Material:
             return Material()
         return Material(base_color=tuple(decode_srgb(np.asarray(main[:3]) / 255.0).tolist()))
     written = factors.get(source.name or "", {})
+    pbr, extensions = written.get("pbrMetallicRoughness", {}), written.get("extensions", {})
+    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    red, green, blue = (float(strength * value) for value in written.get("emissiveFactor", (0.0, 0.0, 0.0)))
     material = Material(
-        base_color=tuple(written.get("baseColorFactor", (1.0, 1.0, 1.0))[:3]),
-        metallic=float(written.get("metallicFactor", 1.0)),
-        roughness=float(written.get("roughnessFactor", 1.0)),
+        base_color=tuple(pbr.get("baseColorFactor", (1.0, 1.0, 1.0))[:3]),
+        metallic=float(pbr.get("metallicFactor", 1.0)),
+        roughness=float(pbr.get("roughnessFactor", 1.0)),
+        transmission=float(extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)),
+        ior=float(extensions.get("KHR_materials_ior", {}).get("ior", 1.5)),
+        emission=(red, green, blue),
     )
     if source.baseColorTexture is not None:
         texture = np.asarray(source.baseColorTexture.convert("RGB"), np.float32) / 255
@@ -152,4 +193,7 @@ def _material(source: Any, factors: dict[str, dict[str, Any]]) -> Material:
     if source.metallicRoughnessTexture is not None:
         texture = np.asarray(source.metallicRoughnessTexture.convert("RGB"), np.float32) / 255
         material = replace(material, metallic_texture=texture[..., 2], roughness_texture=texture[..., 1])
+    if source.emissiveTexture is not None and any(material.emission):
+        texture = np.asarray(source.emissiveTexture.convert("RGB"), np.float32) / 255
+        material = replace(material, emission_texture=decode_srgb(texture))
     return material
