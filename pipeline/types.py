@@ -184,7 +184,7 @@ class Emitter(Record):
     direction: Array  # (3,), unit, world frame: towards the light, mean weighted by irradiance
     solid_angle_sr: float  # of its texels
     half_angle_rad: float  # of the uniform disc of the same spread
-    irradiance: Array  # (3,), at normal incidence, ACEScg: integral of radiance over the texels
+    irradiance: Array  # (3,), ACEScg, of its texels alone on a surface that faces ``direction``
     texels: Indices  # (N,), flat indices (row * width + column) into the environment, ascending
 
 

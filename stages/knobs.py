@@ -55,6 +55,13 @@ class Probe(Params):
     rim: float = Field(0.97, gt=0.5, lt=1, description="outermost radius used, as a fraction of the ball's")
 
 
+class Lights(Params):
+    """Compact lights of the environment."""
+
+    min_share: float = Field(0.02, ge=0.001, le=1, description="least share of the light to be told from sky")
+    max_half_angle_deg: float = Field(10.0, gt=0, le=45, description="wider lights stay in the sky [degrees]")
+
+
 class Plane(Params):
     """The local scene's plane."""
 
@@ -100,8 +107,8 @@ class Report(Params):
 
 KNOBS: dict[str, type[Params]] = {
     "ingest": Ingest, "merge": Merge, "develop": Develop, "calibrate": Calibrate, "pose": Pose, "probe": Probe,
-    "plane": Plane, "reflectance": Reflectance, "render": Render, "composite": Composite, "evaluate": Evaluate,
-    "report": Report,
+    "lights": Lights, "plane": Plane, "reflectance": Reflectance, "render": Render, "composite": Composite,
+    "evaluate": Evaluate, "report": Report,
 }  # fmt: skip
 
 # What each preset changes from the defaults above.

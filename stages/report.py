@@ -30,6 +30,7 @@ TITLES = {
         "The board's squares drawn through the estimated lens and pose must lie on its print.",
     ),
     "probe": ("The light", "The mirror ball unwrapped to a world-oriented map; blind directions are marked."),
+    "lights": ("Lamps and sky", "Compact lights told apart from the map; each casts its own hard shadow."),
     "plane": ("The local scene", "The rectangle of the plane whose light the objects change."),
     "reflectance": ("What the surface reflects", "The plate over the light the probe saw, equations 6 to 8."),
     "render": ("With and without", "LS_obj and LS_noobj on the same samples; only their difference touches the plate."),
