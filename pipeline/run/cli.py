@@ -18,9 +18,14 @@ from pipeline.run import closure
 from pipeline.run.errors import InsituError, ManifestError
 
 if TYPE_CHECKING:
+    from pipeline.run.runner import Build
     from pipeline.run.settings import Settings
 
-EPILOG = "Exit codes: 0 done, 2 manifest or switch, 3 photographs, 4 build files, 5 external tool, 6 no unique answer."
+EPILOG = (
+    "Exit codes: 0 done, 2 manifest or switch, 3 photographs, 4 build files, 5 external tool, 6 no unique answer, "
+    "130 interrupted. Ctrl-C keeps the best picture so far, twice stops at once; the same command goes on."
+)
+LOOKING = {"display": "display", "view": "view of the display", "look": "look"}  # knobs of composite with a switch
 
 
 def stage_names() -> tuple[str, ...]:
@@ -48,6 +53,11 @@ def build_parser() -> argparse.ArgumentParser:
         sub.add_argument("--scene", type=Path, help="scene.toml (default: the one beside capture.toml)")
         sub.add_argument("--quality", choices=["draft", "preview", "final"], help="preset (default: scene.toml's)")
         sub.add_argument("--set", action="append", default=[], metavar="STAGE.KNOB=VALUE", help="set one knob")
+        return looking(sub)
+
+    def looking(sub: argparse.ArgumentParser) -> argparse.ArgumentParser:
+        for knob, text in LOOKING.items():
+            sub.add_argument(f"--{knob}", help=f"{text} of the OCIO config ($OCIO, else a built-in one)")
         return sub
 
     run = asking(verb("run", "run every stage that is not up to date, in one process"))
@@ -60,6 +70,8 @@ def build_parser() -> argparse.ArgumentParser:
         sub.set_defaults(stage=name)
         if name == "evaluate":
             _scoring(sub)
+        if name == "composite":
+            looking(sub)
     simulate = verb("simulate", closure.summary("stages.simulate"), capture=False)
     simulate.add_argument("scene", type=Path, help="SCENE.toml")
     simulate.add_argument("folder", type=Path, help="folder of the new capture")
@@ -166,14 +178,25 @@ def resolved(args: argparse.Namespace) -> Settings:
     chosen = resolve(
         args.capture, getattr(args, "scene", None), getattr(args, "quality", None), switches, KNOBS, PRESETS
     )
-    wanted, known = chosen.params["composite"], KNOBS["composite"]().model_dump()
-    if os.environ.get("OCIO") or any(wanted[key] != known[key] for key in ("display", "view")):
+    return looked_at(chosen, args)
+
+
+def looked_at(chosen: Settings, args: argparse.Namespace) -> Settings:
+    """The settings with the switches for looking put in. Raises ManifestError for what the OCIO config lacks."""
+    from stages.knobs import KNOBS
+
+    known = KNOBS["composite"]().model_dump()
+    given = {knob: value for knob in LOOKING if (value := getattr(args, knob, None)) is not None}
+    wanted = known | chosen.params["composite"] | given
+    if os.environ.get("OCIO") or any(wanted[knob] != known[knob] for knob in LOOKING if knob in known):
         import numpy as np
 
         from pipeline.image.display import display_transform
 
-        display_transform(np.zeros((1, 1, 3)), wanted["display"], wanted["view"])  # now, not after the rendering
-    return chosen
+        display_transform(
+            np.zeros((1, 1, 3)), **{knob: wanted[knob] for knob in LOOKING if knob in wanted}
+        )  # now, not after rendering
+    return chosen.model_copy(update={"params": {**chosen.params, "composite": wanted}}) if given else chosen
 
 
 def with_build(args: argparse.Namespace) -> int:
@@ -196,11 +219,13 @@ def with_build(args: argparse.Namespace) -> int:
         chosen = asked.load(out)
         if Path(chosen.capture) != (file := load_capture(args.capture)[1].resolve()):
             raise ManifestError(f"{out}: is a build of {chosen.capture}, not of {file}; give another --out")
+        if any(getattr(args, knob, None) is not None for knob in LOOKING):
+            chosen = looked_at(chosen, args)
+            asked.save(chosen, out)
     if args.verb == "settings":
         return 0
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
     from pipeline.run.derive import print_summary
-    from pipeline.run.formats import write_bytes
     from pipeline.run.progress import shown
     from pipeline.run.runner import Build
     from stages.order import graph
@@ -213,12 +238,21 @@ def with_build(args: argparse.Namespace) -> int:
         problems = build.verify()
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
+    with shown(), build.stop.listening():
+        return at_work(args, build, last)
+
+
+def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
+    """Verbs that compute."""
+    from pipeline.run.derive import print_summary, unfinished
+
     if getattr(args, "with_truth", None):
+        from pipeline.run.formats import write_bytes
         from pipeline.run.substitution import FIGURES, waterfall
 
         say(f"{'truth in place of':<32}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
         found = waterfall(build, [name.strip() for name in args.with_truth.split(",")], say)
-        write_bytes(out / "waterfall.json", json.dumps(found, indent=1).encode() + b"\n")
+        write_bytes(build.out / "waterfall.json", json.dumps(found, indent=1).encode() + b"\n")
         return 0
     stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
 
@@ -226,8 +260,11 @@ def with_build(args: argparse.Namespace) -> int:
         variant = (build.record(name) or {"numbers": {}})["numbers"].get("variant", "")
         say(f"{name:<12} {outcome:<6} {seconds:7.2f} s  {variant}".rstrip())
 
-    with shown(), build.stop.listening():
-        build.run_all(stages, tell)
+    build.run_all(stages, tell)
     if args.verb == "run" and last == stage_names()[-1]:
         say(print_summary(build))
-    return 0
+    if not build.stop.asked:
+        return 0
+    kept = ", ".join(unfinished(build)) or "everything that was asked for was done"
+    say(f"insitu: interrupted; {kept}; run the same command to go on from there", stream=sys.stderr)
+    return 130

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.run import closure
-from pipeline.run.runner import Build
+from pipeline.run.runner import Build, is_complete
 from pipeline.run.stage import Graph
 
 
@@ -61,11 +61,22 @@ def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
 
 
+def unfinished(build: Build) -> list[str]:
+    """A few words on each stage that was interrupted."""
+    records = [(stage.name, build.record(stage.name)) for stage in build.graph.stages]
+    return [
+        f"{name} kept at {record['numbers'].get('share_done', 0.0):.0%}"
+        for name, record in records
+        if record and not is_complete(record)
+    ]
+
+
 def print_summary(build: Build) -> str:
-    """Paths, errors beside doing nothing, and seconds per stage."""
+    """Paths, what was interrupted, errors beside doing nothing, and seconds per stage."""
     from pipeline.run.artifacts import COMPOSITE, DISPLAY, METRICS, REPORT
 
     lines = ["", f"quality  {build.settings.quality}"]
+    lines += [f"{words}: run again to complete it" for words in unfinished(build)]
     for label, artifact in (("picture", DISPLAY), ("EXR", COMPOSITE), ("report", REPORT)):
         path = build.out / build.graph.producer[artifact.name].name / artifact.filename
         lines.append(f"{label:<8} {path}" + ("" if path.exists() else "  (not made yet)"))
