@@ -19,7 +19,7 @@ from pipeline.run import artifacts as A
 from pipeline.run.errors import NumericalError
 from pipeline.run.stage import Stage
 from pipeline.transport.reflectance import fill_unseen, updated_brdf
-from pipeline.types import Camera, Plane, Raster, Result, View
+from pipeline.types import Camera, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
 MAX_SUPERSAMPLE = 2
@@ -57,6 +57,7 @@ def compute(
     views: dict[str, View],
     environment: Raster,
     plane: Plane,
+    proxies: list[Proxy],
     params: knobs.Reflectance,
 ) -> Result:
     """Albedo texture, ACEScg. Raises NumericalError when no light arrives or the plate does not show the plane."""
@@ -87,7 +88,9 @@ def compute(
     numbers["texel_mm"] = float(1e3 * size.max() / params.texture_px)
     numbers["seen_fraction"] = float((seen > 0.5).mean())
     raster = Raster({**Raster.split(np.clip(albedo, 0.0, 0.98)), "seen": seen}, ACESCG, {"insitu:unit": "albedo"})
-    return Result({"albedo": raster}, numbers, warnings, evidence(params.model))
+    return Result(
+        {"albedo": raster, "surface": Surface(), "local_proxies": proxies}, numbers, warnings, evidence(params.model)
+    )
 
 
 def judge(measured: np.ndarray, light: np.ndarray, albedo: np.ndarray) -> tuple[dict[str, Any], list[str]]:
@@ -147,6 +150,7 @@ STAGE = Stage(
         "views": A.VIEWS,
         "environment": A.ENVIRONMENT,
         "plane": A.PLANE,
+        "proxies": A.PROXIES,
     },
-    outputs={"albedo": A.ALBEDO},
+    outputs={"albedo": A.ALBEDO, "surface": A.SURFACE, "local_proxies": A.LOCAL_PROXIES},
 )

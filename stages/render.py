@@ -1,15 +1,14 @@
 """What the objects are and what they change: object layer, lost and gained light, where it matters.
 
-A pilot on cells of eight pixels says what changes by more than ``threshold`` of LS_noobj, and where that change is
-smooth enough to be interpolated; only the rest is traced pixel by pixel. ``strategy = "difference"`` estimates the
-change itself; ``"reference"`` traces two full images with the same random numbers, every pixel. Pixels that objects
-cover get more samples. Limits: one plane as local scene, distant light.
+``strategy = "difference"`` estimates the change itself (`pipeline.transport.difference`); ``"reference"`` traces two
+full images with the same random numbers, every pixel. Sampling goes in passes over two independent halves: the first
+picture is there after seconds, and pixels leave when their noise is below half the photograph's
+(`pipeline.transport.estimate`). Limits: the distant light is the same everywhere; proxies are diffuse.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +18,22 @@ from pipeline.camera.lens import ray_grid
 from pipeline.conventions import ACESCG
 from pipeline.image.colour import Space
 from pipeline.light.environment import irradiance
-from pipeline.light.sampling import bilinear, planes
 from pipeline.run import artifacts as A
+from pipeline.run import progress
 from pipeline.run.errors import ManifestError
-from pipeline.run.progress import report
 from pipeline.run.stage import Stage
-from pipeline.transport.denoise import bounding_window, denoise
-from pipeline.transport.difference import difference_block
+from pipeline.transport.estimate import Canvas, Effort, lit, pictures, prepare, sampled
 from pipeline.transport.meshes import Material, load_meshes
-from pipeline.transport.region import CELL, Region, cell_pixels, plan
+from pipeline.transport.passes import Halves, Interrupted
+from pipeline.transport.region import limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
-from pipeline.transport.trace import Rays, Samples, Strategy, reference_block, trace
+from pipeline.transport.trace import Rays
 from pipeline.transport.variant import use_mitsuba
-from pipeline.types import Camera, Plane, Raster, Result, View
+from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
-STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
-LOOKUP_ROW = 1024  # the lookup takes pictures, whose sides are limited, not long lists
-PILOT_SHARE = 4  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
-OBJECT_BOOST = 4  # more samples where an object is seen
+Outcome = tuple[Raster, dict[str, Any], list[str]]  # layers, numbers, warnings
 
 
 def world_from_object(wish: dict[str, Any], plane: Plane) -> np.ndarray:
@@ -74,85 +69,28 @@ def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any],
 
 
 def tell(what: str) -> Callable[[float], None]:
-    """A progress callback that names its task."""
-    return lambda share: report(what, share)
+    """A progress callback that names its task, and ends it when the user wants to stop."""
 
+    def callback(share: float) -> None:
+        progress.report(what, share)
+        if progress.interrupted():
+            raise Interrupted
 
-def find_region(worlds: Worlds, rays: Rays, shape: tuple[int, int], light: np.ndarray, params: knobs.Render) -> Region:
-    """What to leave, interpolate and trace; the reference strategy interpolates nothing."""
-    index, grid = cell_pixels(*shape)
-    samples = max(64, PILOT_SHARE * params.samples)
-    pilot = trace(
-        difference_block, worlds, rays[index], samples, params.depth, params.seed + 1, CELL, tell("render: pilot")
-    )
-    region = plan(pilot, grid, shape, light, params.threshold)
-    return replace(region, traced=region.weight > 0) if params.strategy == "reference" else region
-
-
-def plane_albedo(plane: Plane, albedo: Raster, rays: Rays) -> np.ndarray:
-    """(N, 3) albedo where the middle of each pixel meets the modelled rectangle; rays must meet it."""
-    along_u, along_v = plane.corners_m[1] - plane.corners_m[0], plane.corners_m[3] - plane.corners_m[0]
-    reach = (plane.offset_m - plane.normal @ rays.origin) / (rays.centre @ plane.normal)
-    offset = rays.origin + reach[:, None] * rays.centre - plane.corners_m[0]
-    height, width = albedo.shape
-    position = np.stack(
-        [offset @ along_u / (along_u @ along_u) * width, offset @ along_v / (along_v @ along_v) * height]
-    )
-    folded = np.pad(position, ((0, 0), (0, -len(rays) % LOOKUP_ROW))).reshape(2, -1, LOOKUP_ROW)
-    return bilinear(planes(albedo.rgb()), *folded).reshape(-1, 3)[: len(rays)].astype(float)
-
-
-def interpolated(region: Region, pixels: np.ndarray, albedo: np.ndarray, light: np.ndarray) -> Samples:
-    """The smooth part of the change as if it had been traced: relative change times LS_noobj of each pixel."""
-    model = albedo * light / np.pi
-    nothing, whole = np.zeros(len(pixels)), np.ones(len(pixels))
-
-    def at(field: np.ndarray) -> np.ndarray:
-        return field.reshape(-1, 3)[pixels]
-
-    return Samples(
-        obj=np.zeros_like(model),
-        alpha=nothing,
-        lost=at(region.lost) * model,
-        gained=at(region.gained) * model,
-        without=model,
-        albedo=albedo,
-        obj_albedo=np.zeros_like(model),
-        obj_normal=np.zeros_like(model),
-        ground=whole,
-        obj_variance=np.zeros_like(model),
-        change_variance=at(region.variance) * model**2,
-    )
-
-
-def trace_region(worlds: Worlds, rays: Rays, params: knobs.Render) -> Samples:
-    """The pixels of the region, then those that show an object again with more samples, merged by sample count."""
-    strategy = STRATEGIES[params.strategy]
-    first = trace(
-        strategy, worlds, rays, params.samples, params.depth, params.seed + 2, progress=tell("render: shadows")
-    )
-    shown = np.flatnonzero(first.alpha > 0)
-    if not len(shown):
-        return first
-    again = trace(
-        strategy,
-        worlds,
-        rays[shown],
-        params.samples * OBJECT_BOOST,
-        params.depth,
-        params.seed + 3,
-        progress=tell("render: objects"),
-    )
-    return first.merged(shown, again, OBJECT_BOOST / (1 + OBJECT_BOOST))
+    return callback
 
 
 def compute(
     wishes: dict[str, Any],
     camera: Camera,
     views: dict[str, View],
+    photographs: dict[str, Raster],
     environment: Raster,
+    emitters: list[Emitter],
     plane: Plane,
     albedo: Raster,
+    surface: Surface,
+    local_proxies: list[Proxy],
+    occluders: list[Occluder],
     params: knobs.Render,
 ) -> Result:
     """Layers of the size of the plate, ACEScg. Raises ManifestError when an object file cannot be used."""
@@ -163,33 +101,123 @@ def compute(
             {"influenced_fraction": 0.0},
             ["scene.toml: no objects; the plate comes back"],
         )
-    mi = use_mitsuba()
     shapes, warnings = place_objects(wishes, plane)
-    radiance = environment.rgb()
-    worlds = build_worlds(plane, albedo.rgb(), radiance, shapes)
-    light = irradiance(radiance, plane.normal[None])[0]
     xn, dxn = ray_grid(camera)
     rays = Rays.of(views["plate"].world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
-    region = find_region(worlds, rays, shape, light, params)
-    traced, smooth = np.flatnonzero(region.traced), np.flatnonzero(region.interpolated)
-    if not len(traced) + len(smooth):
+    plate = photographs["plate"]
+    noise = relative_noise(plate)
+    limits = limits_for(plate.rgb(), plate.rgb("variance"), params.threshold)
+    effort = Effort(
+        params.strategy, params.samples, params.depth, params.denoise, params.seed, adaptive=not params.light_groups
+    )
+
+    def worlds_under(light: np.ndarray, lamps: list[Emitter]) -> tuple[Worlds, np.ndarray]:
+        worlds = build_worlds(plane, albedo.rgb(), light, shapes, local_proxies, lamps, surface, occluders)
+        return worlds, irradiance(light, plane.normal[None])[0]
+
+    worlds, light = worlds_under(environment.rgb(), emitters)
+    canvas, left = prepare(worlds, rays, shape, light, noise, limits, effort, tell)
+    if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
-    parts = [interpolated(region, smooth, plane_albedo(plane, albedo, rays[smooth]), light)]
-    if len(traced):
-        parts.append(trace_region(worlds, rays[traced], params))
-    pixels = np.concatenate([smooth, traced])
-    samples = Samples.joined(parts)
-    images = to_images(samples, pixels, shape, light)
-    numbers = measure(samples, region.weight, light, params)
-    if params.denoise:
-        images, moved = quieted(images, region.traced)
-        numbers |= moved
-    layers = to_layers(images, region.weight)
-    numbers["traced_fraction"] = float(region.traced.mean())
-    numbers["variant"] = mi.variant()
-    if samples.not_finite:
-        warnings.append(f"render: {samples.not_finite} samples were not finite and count as zero")
-    return Result({"layers": layers}, numbers, warnings, evidence(params, numbers))
+    numbers: dict[str, Any] = left | {
+        "threshold": limits.threshold,
+        "step_over_hidden_step": left["left_out_max"] / limits.hidden,
+        "lights": len(emitters) + 1,
+        "variant": use_mitsuba().variant(),
+    }
+    if params.light_groups:
+        parts = {name: worlds_under(*part) for name, part in groups(environment.rgb(), emitters).items()}
+        result = by_group({name: lit(canvas, *part) for name, part in parts.items()})
+    else:
+        result = refined(canvas)
+    layers, found, said = result
+    numbers |= found
+    return Result({"layers": layers}, numbers, warnings + said, evidence(params, numbers))
+
+
+def refined(canvas: Canvas) -> Outcome:
+    """Passes until nothing is open, shown as they come; goes on from a checkpoint; ends early when asked to."""
+    saved = progress.checkpoint_load()
+    halves = None if saved is None else Halves.of_arrays(saved)
+    stopped = False
+    try:
+        for halves in sampled(canvas, halves, tell("render")):  # noqa: B020  the last one is wanted
+            progress.offer(lambda halves=halves: offered(canvas, halves))  # type: ignore[misc]
+            stopped = progress.interrupted()
+            progress.checkpoint_save(halves.arrays)
+            if stopped:
+                break
+    except Interrupted:
+        stopped = True
+        if halves is None:
+            raise KeyboardInterrupt from None
+        progress.checkpoint_save(halves.arrays)
+    assert halves is not None
+    layers, numbers, warnings = outcome(canvas, halves)
+    if stopped and halves.open.any():
+        share = float(halves.both.count.sum() / (halves.both.count + halves.open * canvas.effort.samples).sum())
+        numbers |= {"complete": False, "share_done": share}
+        warnings = [*warnings, f"render: interrupted; about {share:.0%} of the samples are in the picture"]
+    return layers, numbers, warnings
+
+
+def offered(canvas: Canvas, halves: Halves) -> Result:
+    """What there is so far."""
+    layers, numbers, warnings = outcome(canvas, halves)
+    return Result({"layers": layers}, numbers, warnings)
+
+
+def outcome(canvas: Canvas, halves: Halves) -> Outcome:
+    """Layers, numbers and warnings of what has been sampled."""
+    images, numbers = pictures(canvas, halves)
+    numbers |= measure(canvas, halves)
+    missing = numbers["not_finite_samples"]
+    warnings = [f"render: {missing} samples were not finite and count as zero"] if missing else []
+    return to_layers(images, canvas.region.weight), numbers, warnings
+
+
+def groups(light: np.ndarray, emitters: list[Emitter]) -> dict[str, tuple[np.ndarray, list[Emitter]]]:
+    """The environment (H, W, 3) of each light group alone, and the emitters in it. Their sum is the environment."""
+    sky = light.reshape(-1, 3).copy()
+    parts = {}
+    for emitter in emitters:
+        alone = np.zeros_like(sky)
+        texels = np.asarray(emitter.texels, int)
+        alone[texels] = sky[texels]
+        sky[texels] = 0
+        parts[emitter.name] = (alone.reshape(light.shape), [emitter])
+    return {"sky": (sky.reshape(light.shape), []), **parts}
+
+
+def by_group(canvases: dict[str, Canvas]) -> Outcome:
+    """Every light group alone, and their sum, which is the result: light is additive."""
+    total: Raster | None = None
+    channels: dict[str, np.ndarray] = {}
+    numbers: dict[str, Any] = {}
+    warnings: list[str] = []
+    for name, canvas in canvases.items():
+        *_, halves = sampled(canvas, None, tell(f"render: {name}"))
+        layers, numbers, said = outcome(canvas, halves)
+        warnings += said
+        for layer in ("obj", "lost", "gained"):
+            channels |= Raster.split(layers.rgb(layer), f"{layer}.{name}")
+        # Coverage comes from the same camera samples in every group, so it is not summed.
+        shared = {"obj.A", "ground", "influence"}
+        if total is None:
+            total = layers
+        else:
+            summed = {n: v if n in shared else v + layers[n] for n, v in total.channels.items()}
+            total = Raster(summed, ACESCG)
+    assert total is not None
+    return Raster(total.channels | channels, ACESCG, {"insitu:groups": ",".join(canvases)}), numbers, warnings
+
+
+def relative_noise(photograph: Raster) -> np.ndarray:
+    """(H, W, 3) standard deviation over radiance; the median where it is unknown."""
+    rgb, variance = photograph.rgb().astype(float), photograph.rgb("variance").astype(float)
+    known = np.isfinite(variance) & (variance > 0) & (rgb > 0)
+    noise = np.sqrt(np.divide(variance, rgb**2, out=np.zeros_like(rgb), where=known))
+    return np.where(known, noise, np.median(noise[known]) if known.any() else 0.0)
 
 
 def empty_layers(shape: tuple[int, int]) -> Raster:
@@ -200,45 +228,6 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
         for c in "RGB"
     ]
     return Raster({name: np.zeros(shape, np.float32) for name in [*names, "obj.A", "ground", "influence"]}, ACESCG)
-
-
-def to_images(samples: Samples, pixels: np.ndarray, shape: tuple[int, int], light: np.ndarray) -> dict[str, np.ndarray]:
-    """Every field of the samples as a picture (H, W, ...), zero where nothing was computed; LS_noobj in closed form."""
-    images = {}
-    for name, values in vars(samples).items():
-        if name != "not_finite":
-            image = np.zeros((shape[0] * shape[1], *values.shape[1:]))
-            image[pixels] = values
-            images[name] = image.reshape(*shape, *values.shape[1:])
-    images["without"] = images["albedo"] * light / np.pi  # equation 7
-    return images
-
-
-def quieted(images: dict[str, np.ndarray], traced: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Lost and gained light and the object layer, denoised; the pictures, and how much light was in speckles."""
-    from scipy.ndimage import distance_transform_edt
-
-    window = bounding_window(traced)
-    view = {name: image[window] for name, image in images.items()}
-    model, shown = view["without"], view["alpha"][..., None]
-    bare = (model > 0).all(-1)
-    # Below an object the ground's values continue, so that its outline is no edge of theirs.
-    nearest = distance_transform_edt(~bare, return_distances=False, return_indices=True) if bare.any() else None
-
-    def relative(part: np.ndarray) -> np.ndarray:
-        ratio = np.divide(part, model, out=np.zeros_like(part), where=model > 0)
-        return ratio if nearest is None else ratio[tuple(nearest)]
-
-    guide = np.repeat(view["ground"][..., None], 3, -1)
-    survives, _ = denoise(np.maximum(1 + relative(view["lost"]), 0), guide)
-    added, moved = denoise(relative(view["gained"]), guide)
-    obj, moved_obj = denoise(view["obj"], view["obj_albedo"], view["obj_normal"])
-    result = {name: image.copy() for name, image in images.items() if name in ("lost", "gained", "obj")}
-    here = traced[window][..., None]
-    result["lost"][window] = np.where(here, np.minimum(survives - 1, 0) * model, view["lost"])
-    result["gained"][window] = np.where(here, added * model, view["gained"])
-    result["obj"][window] = np.where(shown > 0, obj, view["obj"])
-    return images | result, {"speckle_light_moved_change": moved, "speckle_light_moved_object": moved_obj}
 
 
 def to_layers(images: dict[str, np.ndarray], weight: np.ndarray) -> Raster:
@@ -259,15 +248,21 @@ def to_layers(images: dict[str, np.ndarray], weight: np.ndarray) -> Raster:
     return Raster(channels, ACESCG)
 
 
-def measure(samples: Samples, weight: np.ndarray, light: np.ndarray, params: knobs.Render) -> dict[str, Any]:
-    """What was traced, how noisy it is before denoising, and how well the closed form agrees with LS_noobj."""
-    model = samples.albedo * light / np.pi
+def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
+    """What was sampled, how noisy it is before denoising, and how well the closed form agrees with LS_noobj."""
+    samples = halves.both
+    model = samples.albedo * canvas.light_at(canvas.traced) / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
     covered = samples.alpha > 0.99
+    weight = canvas.region.weight
     numbers: dict[str, Any] = {
         "influenced_fraction": float((weight > 0).mean()),
+        "traced_fraction": len(samples.count) / weight.size,
         "object_fraction": float((samples.alpha > 0).sum() / weight.size),
-        "not_finite_samples": samples.not_finite,
+        "not_finite_samples": round(float((samples.not_finite * samples.count).sum())),
+        "samples_per_traced_pixel": float(samples.count.mean()),
+        "quiet_early_fraction": float((samples.count < samples.count.max()).mean()),
+        "passes": halves.passes,
     }
     if bare.any():
         level, noise = np.linalg.norm(model[bare], axis=1), np.sqrt(samples.change_variance[bare].sum(1))
@@ -275,7 +270,7 @@ def measure(samples: Samples, weight: np.ndarray, light: np.ndarray, params: kno
         numbers["deepest_shadow"] = float(
             np.quantile((samples.lost + samples.gained)[bare].sum(1) / model[bare].sum(1), 0.001)
         )
-        if params.strategy == "reference":
+        if canvas.effort.strategy == "reference":
             numbers["noobj_over_closed_form"] = float(samples.without[bare].sum() / model[bare].sum())
     if covered.any():
         level, noise = np.linalg.norm(samples.obj[covered], axis=1), np.sqrt(samples.obj_variance[covered].sum(1))
@@ -289,8 +284,9 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
         {
             "term": "region",
             "modelled": f"{numbers['influenced_fraction']:.1%} of the frame",
-            "because": f"a pilot found the rest to change by less than {params.threshold:.2%}",
-            "could_cost": f"at most {params.threshold:.2%} of the plate outside the region",
+            "because": f"a pilot found the rest to change by less than {numbers['threshold']:.2%}",
+            "could_cost": f"{numbers['left_out_max']:.2%} of the plate where most is left out (pilot noise "
+            f"{numbers['left_out_noise']:.2%}), {numbers['left_out_mean']:+.1e} of the frame's light",
         },
         {
             "term": "every pixel of the region",
@@ -327,9 +323,14 @@ STAGE = Stage(
         "wishes": A.WISHES,
         "camera": A.CAMERA,
         "views": A.VIEWS,
+        "photographs": A.PHOTOGRAPHS,
         "environment": A.ENVIRONMENT,
+        "emitters": A.EMITTERS,
         "plane": A.PLANE,
         "albedo": A.ALBEDO,
+        "surface": A.SURFACE,
+        "local_proxies": A.LOCAL_PROXIES,
+        "occluders": A.OCCLUDERS,
     },
     outputs={"layers": A.LAYERS},
 )

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.conventions import ACESCG, CAMERA_RGB, RADIANCE_UNIT
 from pipeline.run.stage import Artifact
-from pipeline.types import BallFit, Bracket, Camera, Emitter, Occluder, Plane, Proxy, View
+from pipeline.types import BallFit, Bracket, Camera, Emitter, Occluder, Plane, Proxy, Surface, View
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
@@ -51,6 +51,14 @@ EMITTERS = Artifact(
 
 PLANE = Artifact("plane", "json", "plane of the local scene and its modelled rectangle", "m", type=Plane)
 ALBEDO = Artifact("albedo", "raster", "albedo of the modelled rectangle, as a texture: R G B, seen (0..1)", "1", ACESCG)
+
+SURFACE = Artifact(
+    "surface", "json", "how the plane reflects besides its albedo, and the scores that decided", type=Surface
+)
+
+LOCAL_PROXIES = Artifact(
+    "local_proxies", "json", "the proxies with their albedo, measured where it was not given", "m", type=list[Proxy]
+)
 
 LAYERS = Artifact(
     "layers",

@@ -1,14 +1,20 @@
-"""The fast strategy: what the objects change on a plane under distant light, estimated directly.
+"""The fast strategy: what the objects change on the local scene, estimated directly.
 
-At a point x of a convex local scene the two worlds differ only in directions that meet an object:
+At a point x of the local scene the worlds with and without objects differ in two ways: light that an object hides
+(lost), and radiance that arrives from an object instead of what was behind it (gained):
 
-    LS_obj - LS_noobj = rho_d  integral over the objects' solid angle of (L_object - L_distant) cos(theta) dw
+    LS_obj - LS_noobj = integral of f(x, w) (L_obj(w) - L_noobj(w)) cos(theta) dw
 
-so only those directions are sampled. The lost light, ``-L_distant``, combines samples of the lights with samples of the
-cones around the objects' bounding spheres by multiple importance sampling (balance heuristic, Veach and Guibas 1995);
-the gained light, ``L_object``, follows the cone samples with an ordinary path tracer, so colour bleeding, mirrors and
-caustics of every order are in it. LS_noobj is not rendered: it is ``rho_d E`` in closed form (equation 7). Unbiased;
-equal to the reference strategy in the mean (tested).
+The integrand is zero in every direction that meets the same thing in both worlds, unless that thing is another point
+of the local scene whose own light has changed: then the same formula applies there. So a *difference path* starts at
+the camera, runs along local surfaces, and ends where it meets an object; only there do the worlds part, one path
+gathering L_obj, another L_noobj. On a plane under distant light it ends after one step and L_noobj is the distant
+light itself.
+
+Every light group is sampled on its own (an emitter's shadow costs one ray and has no noise in umbra and in light). The
+sky is combined with the sampled directions by multiple importance sampling (balance heuristic, Veach and Guibas 1995):
+directions are drawn towards the bounding spheres of the objects, and from the BSDF where the ground is glossy or local
+surfaces see each other. LS_noobj is not rendered here. Unbiased; equal to the reference strategy in the mean (tested).
 """
 
 from __future__ import annotations
@@ -16,7 +22,9 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.transport.scene import Worlds
-from pipeline.transport.trace import NEVER, Rays, Samples, camera_rays, collect, make_sampler, object_surface
+from pipeline.transport.trace import NEVER, Rays, Samples, camera_hits, collect, make_sampler
+
+CONE_SHARE = 0.5  # of the directions, where the BSDF is sampled too
 
 
 def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
@@ -24,75 +32,153 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     import drjit as dr
 
     mi = worlds.mi
-    scene = worlds.with_objects
     sampler = make_sampler(mi, samples)
     count = sampler.sample_count()
     sampler.set_samples_per_wavefront(count)
     sampler.seed(seed, len(rays) * count)
-    ray = camera_rays(mi, dr, rays, count, sampler.next_2d(), footprint_px)
-    hit = scene.ray_intersect(ray)
-    on_ground = hit.is_valid() & (hit.shape == mi.ShapePtr(worlds.ground_with))
-    on_object = hit.is_valid() & ~on_ground
-    normal = mi.Vector3f(*[float(v) for v in worlds.plane.normal])
-    origin = hit.p + normal * (1e-5 * (1 + dr.max(dr.abs(hit.p))))
+    ray, hit, on_object, on_local = camera_hits(worlds, rays, count, sampler.next_2d(), footprint_px)
 
-    # Light samples: blocked by an object or not.
-    light, radiance = worlds.above.sample_emitter_direction(hit, sampler.next_2d(), False, on_ground)
-    cos_light = dr.dot(light.d, normal)
-    lit = on_ground & (light.pdf > 0) & (cos_light > 0)
-    blocked = lit & scene.ray_test(mi.Ray3f(origin, light.d), lit)
-    pdf_cone = cone_pdf(mi, dr, worlds, origin, light.d)
-    lost = dr.select(blocked, -radiance * light.pdf * cos_light / (light.pdf + pdf_cone), mi.Color3f(0.0))
-
-    # Cone samples: what the object sends instead, less what it hides.
-    toward, pdf_toward = sample_cone(mi, dr, worlds, origin, sampler.next_1d(), sampler.next_2d())
-    cos_toward = dr.dot(toward, normal)
-    aimed = on_ground & (cos_toward > 0) & (pdf_toward > 0)
-
-    # One path per sample: on from the camera where an object is seen, else from the ground towards an object.
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER, "hide_emitters": True})
-    onward = mi.RayDifferential3f(dr.select(on_object, ray.o, origin), dr.select(on_object, ray.d, toward))
-    found, arrives, _ = integrator.sample(scene, sampler, onward, active=on_object | aimed)
-    meets = aimed & arrives
-    hidden, pdf_light = distant_light(mi, worlds, hit, toward, meets)
-    lost -= dr.select(meets, hidden * cos_toward / (pdf_light + pdf_toward), mi.Color3f(0.0))
-    albedo = dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), mi.Color3f(0.0))
-    brdf = albedo * dr.inv_pi
-    gained = dr.select(meets, found * cos_toward / pdf_toward, mi.Color3f(0.0)) * brdf
-    lost *= brdf
-    finite = dr.all(dr.isfinite(found)) & dr.all(dr.isfinite(lost)) & dr.all(dr.isfinite(gained))
     zero = mi.Color3f(0.0)
+    lost, split, beta, behind = follow(worlds, sampler, hit, on_local, depth)
+    # One path per sample: on from the camera where an object is seen, else along the direction that met an object.
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
+    parted = dr.any(beta != 0)
+    onward = mi.RayDifferential3f(dr.select(on_object, ray.o, split.o), dr.select(on_object, ray.d, split.d))
+    found, _, _ = integrator.sample(worlds.with_objects, sampler, onward, active=on_object | parted)
+    gained = dr.select(parted, found * beta, zero)
+    if not worlds.convex:
+        covered, _, _ = integrator.sample(
+            worlds.without_objects, sampler, mi.RayDifferential3f(split.o, split.d), active=behind
+        )
+        lost -= dr.select(behind, covered * beta, zero)
+    finite = dr.all(dr.isfinite(found)) & dr.all(dr.isfinite(lost)) & dr.all(dr.isfinite(gained))
     return collect(
         mi,
         count,
         obj=dr.select(on_object & finite, found, zero),
         lost=dr.select(finite, lost, zero),
         gained=dr.select(finite, gained, zero),
-        without=zero + 0 * albedo,
-        albedo=albedo,
-        surface=object_surface(mi, hit, on_object),
-        masks=(on_object, on_ground, finite),
+        without=zero + 0 * lost,
+        hit=hit,
+        masks=(on_object, on_local, finite),
     )
 
 
-def distant_light(mi: Any, worlds: Worlds, hit: Any, direction: Any, active: Any) -> tuple[Any, Any]:
-    """Radiance of the distant scene along a direction, and the density with which light sampling would choose it."""
+def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> tuple[Any, Any, Any, Any]:
+    """Difference paths from points of the local scene.
+
+    Returns the lost light so far; the ray that met an object and its weight (0 when none did); and, where local
+    surfaces see each other, whether that ray would have met one of them without the objects.
+    """
     import drjit as dr
 
-    emitter = worlds.above.environment()
-    away = dr.zeros(mi.SurfaceInteraction3f)
-    away.wi = -direction
-    record = dr.zeros(mi.DirectionSample3f)
-    record.d = direction
-    pdf = emitter.pdf_direction(hit, record, active)  # the only light of that scene
-    return emitter.eval(away, active), dr.select(active, pdf, 0.0)
+    mi = worlds.mi
+    zero = mi.Color3f(0.0)
+    nothing = dr.zeros(mi.Ray3f, dr.width(active))
+    if worlds.convex:
+        lost, ray, weight, density = step(worlds, sampler, hit, active)
+        meets = dr.any(weight != 0) & worlds.with_objects.ray_test(ray, dr.any(weight != 0))
+        beta = dr.select(meets, weight, zero)
+        return lost - hidden_light(worlds, hit, ray, beta, density, meets), ray, beta, mi.Bool(False)
+
+    def onward(state: tuple[Any, ...]) -> Any:
+        return state[0]
+
+    def bounce(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        active, point, through, left, lost, split, beta, behind, sampler = state
+        taken, ray, weight, density = step(worlds, sampler, point, active)
+        lost += dr.select(active, through * taken, zero)
+        weight = dr.select(active, through * weight, zero)
+        following = worlds.with_objects.ray_intersect(ray, active=active & dr.any(weight != 0))
+        local = worlds.is_local(following)
+        meets = following.is_valid() & ~local
+        covered = meets & worlds.without_objects.ray_test(ray, meets)
+        lost -= hidden_light(worlds, point, ray, dr.select(meets & ~covered, weight, zero), density, meets & ~covered)
+        split = dr.select(meets, ray, split)
+        beta = dr.select(meets, weight, beta)
+        behind |= covered
+        return active & local & (left > 1), following, weight, left - 1, lost, split, beta, behind, sampler
+
+    width = dr.width(active)
+    state = (
+        mi.Bool(active),
+        hit,
+        dr.full(mi.Color3f, 1.0, width),
+        dr.full(mi.UInt32, depth, width),
+        dr.zeros(mi.Color3f, width),
+        nothing,
+        dr.zeros(mi.Color3f, width),
+        dr.full(mi.Bool, False, width),
+        sampler,
+    )
+    state = dr.while_loop(state, lambda *s: onward(s), lambda *s: bounce(s), label="difference path")
+    return state[4], state[5], state[6], state[7]
 
 
-def _cones(mi: Any, dr: Any, worlds: Worlds, origin: Any) -> list[tuple[Any, Any, Any]]:
+def step(worlds: Worlds, sampler: Any, hit: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    """At a local point: direct light that the objects hide (<= 0), and one direction with its weight and density.
+
+    The weight is BSDF times cosine over density, (3,); 0 where the direction leads nowhere.
+    """
+    import drjit as dr
+
+    mi = worlds.mi
+    context = mi.BSDFContext()
+    bsdf = hit.bsdf()
+    normal = dr.mulsign(mi.Vector3f(hit.n), hit.wi.z)
+    origin = hit.p + normal * (1e-5 * (1 + dr.max(dr.abs(hit.p))))  # ten times nearer than Mitsuba's own offset
+    cones = object_cones(worlds, origin)
+    share = 1.0 if worlds.convex and worlds.diffuse else CONE_SHARE
+    lost = mi.Color3f(0.0)
+    for group in worlds.lights:
+        light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(active), False, active)
+        value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(light.d), active & (light.pdf > 0))
+        lit = active & (light.pdf > 0) & (dr.dot(light.d, normal) > 0)
+        shadow = mi.Ray3f(origin, light.d)
+        if not worlds.convex:
+            lit &= ~worlds.without_objects.ray_test(shadow, lit)
+        blocked = lit & worlds.with_objects.ray_test(shadow, lit)
+        if not group.compact:
+            chosen = share * cone_pdf(cones, light.d, normal) + (1 - share) * pdf
+            value *= light.pdf / (light.pdf + chosen)
+        lost -= dr.select(blocked, value * radiance, mi.Color3f(0.0))
+    toward = sample_cone(mi, cones, sampler.next_1d(active), sampler.next_2d(active), normal)
+    if share < 1:
+        drawn, _ = bsdf.sample(context, hit, sampler.next_1d(active), sampler.next_2d(active), active)
+        toward = dr.select(sampler.next_1d(active) < share, toward, hit.to_world(drawn.wo))
+    value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(toward), active)
+    density = share * cone_pdf(cones, toward, normal) + (1 - share) * pdf
+    usable = active & (dr.dot(toward, normal) > 0) & (density > 0)
+    return lost, mi.Ray3f(origin, toward), dr.select(usable, value / density, mi.Color3f(0.0)), density
+
+
+def hidden_light(worlds: Worlds, hit: Any, ray: Any, weight: Any, density: Any, active: Any) -> Any:
+    """Distant light that a direction no longer receives; what of it `step` finds by sampling the light is left out."""
+    import drjit as dr
+
+    mi = worlds.mi
+    total = mi.Color3f(0.0)
+    for group in worlds.lights:
+        if group.compact:
+            continue
+        emitter = group.scene.environment()
+        away = dr.zeros(mi.SurfaceInteraction3f)
+        away.wi = -ray.d
+        record = dr.zeros(mi.DirectionSample3f)
+        record.d = ray.d
+        pdf = emitter.pdf_direction(hit, record, active)  # the only light of that scene
+        total += emitter.eval(away, active) * (density / (density + pdf))
+    return dr.select(active, weight * total, mi.Color3f(0.0))
+
+
+def object_cones(worlds: Worlds, origin: Any) -> list[tuple[Any, Any, Any]]:
     """Per object: axis, cosine of the half angle (-1 when the point is inside the sphere), and share of samples.
 
     Shares follow the cones' solid angles, an upper bound of what each object can change.
     """
+    import drjit as dr
+
+    mi = worlds.mi
     cones = []
     for x, y, z, radius in worlds.bounds:
         offset = mi.Vector3f(float(x), float(y), float(z)) - origin
@@ -107,27 +193,29 @@ def _cones(mi: Any, dr: Any, worlds: Worlds, origin: Any) -> list[tuple[Any, Any
     return [(axis, cosine, share / total) for axis, cosine, share in cones]
 
 
-def cone_pdf(mi: Any, dr: Any, worlds: Worlds, origin: Any, direction: Any) -> Any:
+def cone_pdf(cones: list[tuple[Any, Any, Any]], direction: Any, normal: Any) -> Any:
     """Density [1/sr] with which `sample_cone` chooses a direction."""
-    density = mi.Float(0.0)
-    normal = mi.Vector3f(*[float(v) for v in worlds.plane.normal])
+    import drjit as dr
+
+    density = 0.0 * dr.dot(direction, normal)
     hemisphere = dr.maximum(dr.dot(direction, normal), 0.0) * dr.inv_pi
-    for axis, cosine, share in _cones(mi, dr, worlds, origin):
+    for axis, cosine, share in cones:
         within = dr.select(dr.dot(direction, axis) >= cosine, 1 / (dr.two_pi * dr.maximum(1 - cosine, 1e-12)), 0.0)
         density += share * dr.select(cosine == -1, hemisphere, within)
     return density
 
 
-def sample_cone(mi: Any, dr: Any, worlds: Worlds, origin: Any, choice: Any, point: Any) -> tuple[Any, Any]:
-    """A direction towards one of the objects and its density over all of them."""
-    normal = mi.Vector3f(*[float(v) for v in worlds.plane.normal])
+def sample_cone(mi: Any, cones: list[tuple[Any, Any, Any]], choice: Any, point: Any, normal: Any) -> Any:
+    """A direction towards one of the objects."""
+    import drjit as dr
+
     hemisphere = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
     direction = mi.Vector3f(hemisphere)
     passed = mi.Float(0.0)
-    for axis, cosine, share in _cones(mi, dr, worlds, origin):
+    for axis, cosine, share in cones:
         here = (choice >= passed) & (choice < passed + share)
         local = mi.warp.square_to_uniform_cone(point, cosine)
         aimed = dr.select(cosine == -1, hemisphere, mi.Frame3f(axis).to_world(local))
         direction = dr.select(here, aimed, direction)
         passed += share
-    return direction, cone_pdf(mi, dr, worlds, origin, direction)
+    return direction

@@ -17,6 +17,18 @@ from pipeline.transport.trace import Samples
 CELL = 8  # px
 BLUR = 0.8  # cells: less noise for a bias of a third of the second difference, which the tolerance bounds
 FEATHER = 2 * CELL  # px over which the change fades out at the border of the region
+LEAST = 1e-4  # relative change below which a pilot's noise decides what is left out
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Relative to LS_noobj. ``threshold``: change left to the plate; ``tolerance``: error of interpolation;
+    ``hidden``: the step that the photograph's noise hides.
+    """
+
+    threshold: float
+    tolerance: float
+    hidden: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +56,23 @@ def cell_pixels(height: int, width: int) -> tuple[np.ndarray, tuple[int, int]]:
     return (rows[:, None] * width + columns).ravel(), (len(rows), len(columns))
 
 
-def plan(pilot: Samples, grid: tuple[int, int], shape: tuple[int, int], light: np.ndarray, threshold: float) -> Region:
+def plan(
+    pilot: Samples, model: np.ndarray, grid: tuple[int, int], shape: tuple[int, int], limits: Limits
+) -> tuple[Region, dict[str, float]]:
     """Decide from a pilot on ``grid`` what to do with each of the ``shape`` (H, W) pixels.
 
     Args:
         pilot: samples of the cells, in rows.
+        model: (cells, 3) expected LS_noobj of the cells.
         grid: rows and columns of cells.
         shape: (H, W) of the photograph.
-        light: (3,) irradiance on the plane.
-        threshold: change relative to LS_noobj below which the plate is left alone; half of it is the tolerance of the
-            interpolation.
+        limits: what may be left out, and how far interpolation may err.
+
+    Returns the region, and what of the change is left out: the largest, the noise of that figure, and the mean over the
+    frame, relative to LS_noobj.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
-    model = pilot.albedo * light / np.pi
     usable = ((model > 0).all(1) & (pilot.ground > 0.5))[:, None]
 
     def field(values: np.ndarray) -> np.ndarray:
@@ -68,18 +83,44 @@ def plan(pilot: Samples, grid: tuple[int, int], shape: tuple[int, int], light: n
     lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
     smoothed = gaussian_filter(lost + gained, (BLUR, BLUR, 0), mode="nearest")
     shown = pilot.alpha.reshape(grid) > 0
-    changed = (np.abs(smoothed).max(-1) > threshold) | shown
+    changed = (np.abs(smoothed).max(-1) > limits.threshold) | shown
     changed = binary_dilation(changed, np.ones((5, 5)))
-    rough = np.maximum(bend(lost), bend(gained)) > threshold / 2
+    rough = np.maximum(bend(lost), bend(gained)) > limits.tolerance
     rough |= shown | (pilot.ground.reshape(grid) < 1)
     traced = changed & binary_dilation(rough, np.ones((3, 3)))
     mask = enlarge(changed, shape)
     weight = np.ones(shape)
+    left = {"left_out_max": 0.0, "left_out_noise": 0.0, "left_out_mean": 0.0}
     if not mask.all():
         ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1)
         weight = ramp * ramp * (3 - 2 * ramp)
+        out = np.abs(smoothed[~changed])
+        left = {
+            "left_out_max": float(out.max()),
+            "left_out_noise": float(np.sqrt(variance[~changed].max())),
+            "left_out_mean": float(smoothed[~changed].sum() / smoothed.size),
+        }
     smooth = [interpolate(values, shape) for values in (lost, gained, variance)]
-    return Region(weight, enlarge(traced, shape) & (weight > 0), *smooth)
+    return Region(weight, enlarge(traced, shape) & (weight > 0), *smooth), left
+
+
+def limits_for(plate: np.ndarray, variance: np.ndarray, threshold: float) -> Limits:
+    """Limits under which nobody can see the region's border: tied to the photograph's own noise.
+
+    A change that is cut off at the relative size t leaves a step of at most t between neighbouring cells, even without
+    the feather. It is hidden when it is below a quarter of the noise of a cell's mean, sigma / CELL for the white noise
+    of a photograph: t <= sigma / (4 CELL). The user's ``threshold`` only ever lowers it; below `LEAST` the pilot's own
+    noise would decide.
+
+    Args:
+        plate: (H, W, 3) photograph.
+        variance: (H, W, 3) of its noise; infinite where clipped.
+        threshold: the most that may be left out, relative to LS_noobj.
+    """
+    known = np.isfinite(variance) & (variance > 0) & (plate > 0)
+    sigma = np.sqrt(variance[known]) / plate[known]
+    hidden = float(np.median(sigma)) / (4 * CELL) if sigma.size else threshold
+    return Limits(min(threshold, max(hidden, LEAST)), threshold / 2, hidden)
 
 
 def bend(values: np.ndarray) -> np.ndarray:

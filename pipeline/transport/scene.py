@@ -7,29 +7,55 @@ passes through as arrays (`raw`), never through its colour conversions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pipeline.conventions import latlong_directions
+from pipeline.transport.surfaces import color_texture
 from pipeline.transport.variant import use_mitsuba
-from pipeline.types import Plane
+from pipeline.types import Emitter, Occluder, Plane, Proxy, Surface
+
+UNKNOWN_ALBEDO = 0.5  # of a proxy that nobody measured
+
+
+@dataclass(frozen=True, eq=False)
+class LightGroup:
+    """A part of the distant light that is sampled on its own: an emitter's texels, or all the rest (the sky)."""
+
+    name: str
+    scene: Any  # Mitsuba scene that holds only this light
+    compact: bool  # an emitter: its own samples suffice, no other technique would find it
 
 
 @dataclass(frozen=True, eq=False)
 class Worlds:
-    """The scene with the objects and without them; ``ground`` tells the plane from the objects in either."""
+    """The scene with the objects and without them, and what a strategy has to know about it.
+
+    ``local_with`` are the surfaces of the local scene inside ``with_objects``, the plane first: they tell the local
+    scene from the objects. ``convex`` says that no point of the local scene sees another (a plane alone);
+    ``diffuse`` that all of it reflects without gloss.
+    """
 
     mi: Any
     with_objects: Any
     without_objects: Any
-    ground_with: Any
-    ground_without: Any
-    ground_albedo: Any  # texture, for the albedo at a hit
-    above: Any  # scene that holds only the light from above the plane, for sampling and evaluating it
+    local_with: tuple[Any, ...]
+    lights: tuple[LightGroup, ...]
     plane: Plane
     bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
+    convex: bool = True
+    diffuse: bool = True
+    occluders: Any = None  # scene of real things that hide the objects from the camera; they take no part in the light
+
+    def is_local(self, hit: Any) -> Any:
+        """Mask of the interactions with ``with_objects`` that lie on the local scene."""
+        mask = hit.shape == self.mi.ShapePtr(self.local_with[0])
+        for shape in self.local_with[1:]:
+            mask |= hit.shape == self.mi.ShapePtr(shape)
+        return mask & hit.is_valid()
 
 
 def envmap_grid(rgb: np.ndarray) -> np.ndarray:
@@ -82,33 +108,97 @@ def bounding_sphere(shape: Any) -> np.ndarray:
     return np.array([*(low + high) / 2, np.linalg.norm(high - low) / 2])
 
 
-def build_worlds(plane: Plane, albedo: np.ndarray, environment: np.ndarray, objects: dict[str, Any]) -> Worlds:
+def light_groups(
+    mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray | None
+) -> tuple[LightGroup, ...]:
+    """The environment (H, W, 3) as a partition of its texels: the sky, then each emitter.
+
+    ``normal`` is given when only light from above that plane can matter.
+    """
+    useful = environment if normal is None else above_plane(environment, normal)
+    owner = np.zeros(environment.shape[:2], int).ravel()
+    for number, emitter in enumerate(emitters, 1):
+        owner[np.asarray(emitter.texels, int)] = number
+    owner = owner.reshape(environment.shape[:2])
+    groups = []
+    for number, name in enumerate(["sky", *(emitter.name for emitter in emitters)]):
+        part = np.where((owner == number)[..., None], useful, 0.0)
+        if part.any() or number == 0:
+            distant = environment_emitter(mi, part)
+            groups.append(LightGroup(name, mi.load_dict({"type": "scene", "distant": distant}), number > 0))
+    return tuple(groups)
+
+
+def ground_bsdf(mi: Any, albedo: np.ndarray, surface: Surface | None) -> dict[str, Any]:
+    """BSDF of the plane: diffuse, or the glossy model that `surface` found."""
+    texture = ground_texture(mi, albedo)
+    if surface is None or surface.model == "diffuse":
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    return {
+        "type": "insitu_gltf",
+        "base_color": texture,
+        "metallic": {"type": "uniform", "value": float(surface.metallic)},
+        "roughness": {"type": "uniform", "value": float(surface.roughness)},
+        "f0": {"type": "uniform", "value": float(surface.f0)},
+    }
+
+
+def proxy_shape(mi: Any, proxy: Proxy | Occluder, albedo: np.ndarray | None) -> Any:
+    """A real surface, diffuse, of one albedo (3,); flat faces."""
+    color = np.full(3, UNKNOWN_ALBEDO) if albedo is None else np.asarray(albedo, float)
+    props = mi.Properties()
+    diffuse = {"type": "diffuse", "reflectance": color_texture(mi, color)}
+    props["mesh_bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse})
+    vertices, faces = np.asarray(proxy.vertices_m), np.asarray(proxy.faces)
+    shape = mi.Mesh(proxy.name, len(vertices), len(faces), props)
+    parameters = mi.traverse(shape)
+    parameters["vertex_positions"] = np.ascontiguousarray(vertices.ravel(), np.float32)
+    parameters["faces"] = np.ascontiguousarray(faces.ravel(), np.uint32)
+    parameters.update()
+    return shape
+
+
+def build_worlds(
+    plane: Plane,
+    albedo: np.ndarray,
+    environment: np.ndarray,
+    objects: dict[str, Any],
+    proxies: Sequence[Proxy] = (),
+    emitters: Sequence[Emitter] = (),
+    surface: Surface | None = None,
+    occluders: Sequence[Occluder] = (),
+) -> Worlds:
     """Scenes with and without objects.
 
     Args:
-        plane: the local scene.
+        plane: the local scene's ground.
         albedo: (H, W, 3) texture over the plane's corners (first row at corner 0 to 1), or (3,).
         environment: (H, W, 3) lat-long radiance, the distant scene.
         objects: name -> Mitsuba shape, world frame.
+        proxies: further surfaces of the local scene.
+        emitters: compact lights, as texels of ``environment``; each is sampled on its own.
+        surface: how the plane reflects; diffuse when None.
+        occluders: real things in front of the objects; those that are pictures are left to the composite.
     """
     mi = use_mitsuba()
-    texture = ground_texture(mi, albedo)
-    ground_bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    local = ground_shape(plane, ground_bsdf(mi, albedo, surface))
     shared = {"type": "scene", "distant": environment_emitter(mi, environment)}
     scenes = []
     for synthetic in (objects, {}):
-        ground = mi.load_dict(ground_shape(plane, ground_bsdf))
-        scenes.append((mi.load_dict({**shared, "ground": ground, **synthetic}), ground))
-    (with_objects, ground_with), (without, ground_without) = scenes
-    above = environment_emitter(mi, above_plane(environment, plane.normal))
+        shapes = {"ground": mi.load_dict(local)}
+        shapes |= {f"proxy_{proxy.name}": proxy_shape(mi, proxy, proxy.albedo) for proxy in proxies}
+        scenes.append((mi.load_dict({**shared, **shapes, **synthetic}), tuple(shapes.values())))
+    (with_objects, local_with), (without, _) = scenes
+    hiding = {f"occluder_{o.name}": proxy_shape(mi, o, None) for o in occluders if o.vertices_m is not None}
     return Worlds(
         mi=mi,
         with_objects=with_objects,
         without_objects=without,
-        ground_with=ground_with,
-        ground_without=ground_without,
-        ground_albedo=mi.load_dict(texture),
-        above=mi.load_dict({"type": "scene", "distant": above}),
+        local_with=local_with,
+        lights=light_groups(mi, environment, emitters, None if proxies else plane.normal),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
+        convex=not proxies,
+        diffuse=surface is None or surface.model == "diffuse",
+        occluders=mi.load_dict({"type": "scene", **hiding}) if hiding else None,
     )

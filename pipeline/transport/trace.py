@@ -50,12 +50,13 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Means over the samples of each pixel, and variances of those means. Radiance, ACEScg.
+    """Means over the samples of each pixel, of values and of their squares. Radiance, ACEScg.
 
     What concerns the local scene is over the samples that meet it, divided by *all* samples of the pixel (so it carries
     the share of the pixel left to the local scene).
     """
 
+    count: np.ndarray  # (N,) samples of the pixel
     obj: np.ndarray  # (N, 3) object layer, premultiplied
     alpha: np.ndarray  # (N,)
     lost: np.ndarray  # (N, 3) light of LS_noobj that the objects take away, <= 0
@@ -65,31 +66,56 @@ class Samples:
     obj_albedo: np.ndarray  # (N, 3) base colour of the objects, premultiplied
     obj_normal: np.ndarray  # (N, 3) shading normal of the objects, world, premultiplied
     ground: np.ndarray  # (N,) share of samples that meet the local scene
-    obj_variance: np.ndarray  # (N, 3)
-    change_variance: np.ndarray  # (N, 3) of lost + gained
-    not_finite: int = 0
+    obj_square: np.ndarray  # (N, 3)
+    change_square: np.ndarray  # (N, 3) of lost + gained
+    not_finite: np.ndarray  # (N,) share of samples that were not finite and count as zero
+
+    @classmethod
+    def none(cls, pixels: int) -> Samples:
+        """No sample yet of any of ``pixels``."""
+        flat = ("count", "alpha", "ground", "not_finite")
+        return cls(**{f.name: np.zeros(pixels if f.name in flat else (pixels, 3)) for f in fields(cls)})
 
     @classmethod
     def joined(cls, parts: list[Samples]) -> Samples:
         """Concatenate pixels."""
-        arrays = {
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(cls)
-            if field.name != "not_finite"
-        }
-        return cls(**arrays, not_finite=sum(part.not_finite for part in parts))
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
-    def merged(self, index: np.ndarray, other: Samples, share: float) -> Samples:
-        """Pixels ``index`` averaged with ``other``, which has weight ``share``; the rest as they are."""
+    @property
+    def obj_variance(self) -> np.ndarray:
+        """(N, 3) of the mean `obj`; strata make the true one smaller."""
+        return self._variance(self.obj_square, self.obj)
+
+    @property
+    def change_variance(self) -> np.ndarray:
+        """(N, 3) of the mean `lost + gained`."""
+        return self._variance(self.change_square, self.lost + self.gained)
+
+    def _variance(self, square: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        return np.maximum(square - mean**2, 0) / np.maximum(self.count - 1, 1)[:, None]
+
+    def __getitem__(self, index: Any) -> Samples:
+        return Samples(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def __add__(self, other: Samples) -> Samples:
+        """More samples of the same pixels: blocks that were computed apart, as if they had been one."""
+        count = self.count + other.count
+        own = np.divide(self.count, count, out=np.zeros_like(count), where=count > 0)
+        blended = {"count": count}
+        for name in (f.name for f in fields(self) if f.name != "count"):
+            a, b = getattr(self, name), getattr(other, name)
+            share = own if a.ndim == 1 else own[:, None]
+            blended[name] = a * share + b * (1 - share)
+        return Samples(**blended)
+
+    def placed(self, index: np.ndarray, more: Samples) -> Samples:
+        """``more`` samples of the pixels ``index`` added to those; the rest as they are."""
+        grown = self[index] + more
         result = {}
-        for field in fields(self):
-            values = getattr(self, field.name)
-            if field.name == "not_finite":
-                continue
-            own, theirs = ((1 - share) ** 2, share**2) if "variance" in field.name else (1 - share, share)
-            result[field.name] = values.copy()
-            result[field.name][index] = own * values[index] + theirs * getattr(other, field.name)
-        return Samples(**result, not_finite=self.not_finite + other.not_finite)
+        for f in fields(self):
+            result[f.name] = getattr(self, f.name).copy()
+            result[f.name][index] = getattr(grown, f.name)
+        return Samples(**result)
 
 
 class Strategy(Protocol):
@@ -113,7 +139,8 @@ def trace(
     """Trace ``samples`` camera samples per pixel with paths of at most ``depth`` vertices.
 
     ``footprint_px`` is the side of the square over which camera rays are spread (1 = the pixel, box filter). The same
-    seed gives the same bytes. Samples that are not finite count as zero and are counted.
+    seed gives the same bytes. Samples that are not finite count as zero and are counted. Blocks may be traced apart, in
+    any order, and put together with `Samples.joined` (pixels) and ``+`` (samples, of different seeds).
     """
     pixels = max(1, RAYS_PER_BLOCK // samples)
     parts = []
@@ -142,28 +169,40 @@ def make_sampler(mi: Any, samples: int) -> Any:
     return mi.load_dict({"type": "multijitter" if samples >= 4 else "independent", "sample_count": samples})
 
 
+def camera_hits(worlds: Worlds, rays: Rays, samples: int, jitter: Any, footprint_px: float) -> tuple[Any, ...]:
+    """Camera rays, what they meet, and whether that is an object or the local scene; neither behind an occluder."""
+    import drjit as dr
+
+    mi = worlds.mi
+    ray = camera_rays(mi, dr, rays, samples, jitter, footprint_px)
+    hit = worlds.with_objects.ray_intersect(ray)
+    seen = hit.is_valid()
+    if worlds.occluders is not None:
+        towards = mi.Ray3f(ray.o, ray.d, hit.t, ray.time, ray.wavelengths)
+        seen &= ~worlds.occluders.ray_test(towards, seen)
+    local = worlds.is_local(hit)
+    return ray, hit, seen & ~local, seen & local
+
+
 def reference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
     """The reference strategy: LS_obj and LS_noobj path traced in full, with the same random numbers."""
     import drjit as dr
 
     mi = worlds.mi
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER, "hide_emitters": True})
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
     sampler = make_sampler(mi, samples)
     count = sampler.sample_count()
 
-    def radiance(scene: Any) -> tuple[Any, Any]:
+    def radiance(scene: Any) -> tuple[Any, ...]:
         sampler.set_samples_per_wavefront(count)
         sampler.seed(seed, len(rays) * count)
-        ray = camera_rays(mi, dr, rays, count, sampler.next_2d(), footprint_px)
-        return ray, integrator.sample(scene, sampler, ray)[0]
+        ray, *met = camera_hits(worlds, rays, count, sampler.next_2d(), footprint_px)
+        return integrator.sample(scene, sampler, ray)[0], *met
 
-    ray, with_objects = radiance(worlds.with_objects)
-    _, without_objects = radiance(worlds.without_objects)
-    hit = worlds.with_objects.ray_intersect(ray)
-    on_ground = hit.is_valid() & (hit.shape == mi.ShapePtr(worlds.ground_with))
-    on_object = hit.is_valid() & ~on_ground
+    with_objects, hit, on_object, on_local = radiance(worlds.with_objects)
+    without_objects = radiance(worlds.without_objects)[0]
     finite = dr.all(dr.isfinite(with_objects)) & dr.all(dr.isfinite(without_objects))
-    kept = on_ground & finite
+    kept = on_local & finite
     difference = dr.select(kept, with_objects - without_objects, mi.Color3f(0.0))
     return collect(
         mi,
@@ -172,52 +211,74 @@ def reference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: 
         lost=dr.minimum(difference, 0.0),
         gained=dr.maximum(difference, 0.0),
         without=dr.select(kept, without_objects, mi.Color3f(0.0)),
-        albedo=dr.select(on_ground, worlds.ground_albedo.eval(hit, on_ground), mi.Color3f(0.0)),
-        surface=object_surface(mi, hit, on_object),
-        masks=(on_object, on_ground, finite),
+        hit=hit,
+        masks=(on_object, on_local, finite),
     )
 
 
-def object_surface(mi: Any, hit: Any, on_object: Any) -> tuple[Any, Any]:
-    """Base colour and shading normal where an object is met, else zero: what a denoiser may lean on."""
+def unchanged_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
+    """LS_noobj alone, path traced, where no object hides the local scene: for scenes without a closed form."""
     import drjit as dr
 
-    base = hit.bsdf().eval_diffuse_reflectance(hit, on_object)
-    return dr.select(on_object, base, mi.Color3f(0.0)), dr.select(on_object, hit.sh_frame.n, mi.Normal3f(0.0))
+    mi = worlds.mi
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
+    sampler = make_sampler(mi, samples)
+    count = sampler.sample_count()
+    sampler.set_samples_per_wavefront(count)
+    sampler.seed(seed, len(rays) * count)
+    ray, hit, on_object, on_local = camera_hits(worlds, rays, count, sampler.next_2d(), footprint_px)
+    radiance, _, _ = integrator.sample(worlds.without_objects, sampler, ray, active=on_local)
+    finite = dr.all(dr.isfinite(radiance))
+    zero = mi.Color3f(0.0) + 0 * radiance
+    without = dr.select(on_local & finite, radiance, mi.Color3f(0.0))
+    return collect(mi, count, zero, zero, zero, without, hit, (on_object, on_local, finite))
+
+
+def centre_albedo(worlds: Worlds, rays: Rays) -> np.ndarray:
+    """(N, 3) albedo of the local scene where the middle of each pixel meets it, zero where it does not."""
+    import drjit as dr
+
+    mi = worlds.mi
+    centre = mi.Point2f(0.5) + dr.zeros(mi.Point2f, len(rays))
+    _, hit, _, on_local = camera_hits(worlds, rays, 1, centre, 0.0)
+    albedo = hit.bsdf().eval_diffuse_reflectance(hit, on_local)
+    return np.asarray(dr.select(on_local, albedo, mi.Color3f(0.0))).T.astype(float)
 
 
 def collect(
-    mi: Any,
-    count: int,
-    obj: Any,
-    lost: Any,
-    gained: Any,
-    without: Any,
-    albedo: Any,
-    surface: tuple[Any, Any],
-    masks: tuple[Any, Any, Any],
+    mi: Any, count: int, obj: Any, lost: Any, gained: Any, without: Any, hit: Any, masks: tuple[Any, Any, Any]
 ) -> Samples:
-    """Sum the samples of each pixel. ``masks``: meets an object, meets the local scene, is finite."""
+    """Sum the samples of each pixel. ``masks``: meets an object, meets the local scene, is finite.
+
+    The surface that is seen gives its base colour (and an object its shading normal) as well: what divides LS_noobj by
+    the light, and what a denoiser may lean on.
+    """
     import drjit as dr
 
-    ones = [dr.select(mask, mi.Float(1.0), mi.Float(0.0)) for mask in (masks[0], masks[1], ~masks[2])]
-    change = lost + gained
-    triples = [obj, lost, gained, without, albedo, *surface, dr.square(obj), dr.square(change)]
-    planes = [*(channel for triple in triples for channel in triple), *ones]
-    planes = [mi.Float(plane) for plane in planes]
+    on_object, on_local, finite = masks
+    base = hit.bsdf().eval_diffuse_reflectance(hit, on_object | on_local)
+    zero = mi.Color3f(0.0)
+    triples = [
+        obj,
+        lost,
+        gained,
+        without,
+        dr.select(on_local, base, zero),
+        dr.select(on_object, base, zero),
+        dr.select(on_object, mi.Color3f(hit.sh_frame.n), zero),
+        dr.square(obj),
+        dr.square(lost + gained),
+    ]
+    ones = [dr.select(mask, mi.Float(1.0), mi.Float(0.0)) for mask in (on_object, on_local, ~finite)]
+    planes = [mi.Float(plane) for plane in [*(channel for triple in triples for channel in triple), *ones]]
     dr.eval(planes)  # once, else each sum below would run the whole kernel again
     means = np.stack([np.asarray(dr.block_sum(plane, count)) for plane in planes]).astype(np.float64) / count
     names = ("obj", "lost", "gained", "without", "albedo", "obj_albedo", "obj_normal", "obj_square", "change_square")
-    triple = {name: means[3 * i : 3 * i + 3].T for i, name in enumerate(names)}
     alpha, ground, not_finite = means[3 * len(names) :]
-    spread = 1.0 / max(count - 1, 1)
-    obj_square, change_square = triple.pop("obj_square"), triple.pop("change_square")
-    mean_change = triple["lost"] + triple["gained"]
     return Samples(
-        **triple,
+        **{name: means[3 * i : 3 * i + 3].T for i, name in enumerate(names)},
+        count=np.full(len(alpha), float(count)),
         alpha=alpha,
         ground=ground,
-        obj_variance=np.maximum(obj_square - triple["obj"] ** 2, 0) * spread,
-        change_variance=np.maximum(change_square - mean_change**2, 0) * spread,
-        not_finite=round(not_finite.sum() * count),
+        not_finite=not_finite,
     )
