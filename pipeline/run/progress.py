@@ -10,6 +10,7 @@ import contextlib
 import logging
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TextIO
@@ -90,8 +91,8 @@ def checkpoint_load() -> Arrays | None:
 def checkpoint_save(make: Callable[[], Arrays]) -> None:
     """Keep what the stage needs to go on from here. Call it after every block.
 
-    ``make`` is called, and the file written, at most every few seconds and for a twentieth of the stage's time; at
-    once when the stage is `interrupted`, so ask that *before* saving and stop after it. Arrays of objects are refused.
+    ``make`` is called, and the file written, at most every ten seconds and for a twentieth of the stage's time; at once
+    when the stage is `interrupted`, so ask that *before* saving and stop after it. Arrays of objects are refused.
     """
     _host.get().checkpoint_save(make)
 
@@ -99,23 +100,27 @@ def checkpoint_save(make: Callable[[], Arrays]) -> None:
 class TimeLeft:
     """Seconds left of one task from the shares it reports; None until they mean something.
 
-    The mean rate since the first report, whatever share that had: a task that goes on from a checkpoint begins at more
-    than zero, and what came before the first report was preparation.
+    The mean rate of the later half of the time since the first report: smooth, and what is slow at the beginning only
+    (kernels being compiled, the first picture) is forgotten. The first report may have any share: a task that goes on
+    from a checkpoint begins at more than zero.
     """
 
-    MIN_SECONDS, MIN_SHARE = 2.0, 0.02  # since the first report
+    MIN_SECONDS, MIN_SHARE = 2.0, 0.05  # since the first report
 
     def __init__(self) -> None:
         self.first: tuple[float, float] | None = None
+        self.later: deque[tuple[float, float]] = deque()  # reports, from the last one of the earlier half on
 
     def update(self, now: float, share: float) -> float | None:
         """Seconds left at time ``now`` [s] with ``share`` done."""
-        if self.first is None:
-            self.first = now, share
-        seconds, gained = now - self.first[0], share - self.first[1]
-        if seconds < self.MIN_SECONDS or gained < self.MIN_SHARE:
+        self.first = self.first or (now, share)
+        self.later.append((now, share))
+        while len(self.later) > 1 and self.later[1][0] <= (self.first[0] + now) / 2:
+            self.later.popleft()
+        if now - self.first[0] < self.MIN_SECONDS or share - self.first[1] < self.MIN_SHARE:
             return None
-        return seconds * max(1 - share, 0.0) / gained
+        seconds, gained = now - self.later[0][0], share - self.later[0][1]
+        return seconds * max(1 - share, 0.0) / gained if gained > 0 else None
 
 
 def spoken(seconds: float) -> str:

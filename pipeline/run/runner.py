@@ -149,7 +149,7 @@ class Build:
         record = wanted | {"outputs": outputs} | seconds | measured
         formats.write_bytes(folder / "record.json", _json(record))
         for warning in result.warnings:
-            log.warning("%s: %s", stage.name, warning)
+            log.warning("%s: %s", stage.name, warning.removeprefix(f"{stage.name}: "))
         if not is_complete(record):
             os.utime(folder / "record.json", (0, 0))  # older than all it needs, so that make asks for it again
             return "part"
