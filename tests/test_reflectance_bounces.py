@@ -58,7 +58,7 @@ GRID = [(name, texture, seed) for name in SCENES for texture in ("uniform", "fac
 
 @pytest.mark.parametrize("radius", [0.15, 0.3, 0.45, 0.52, 0.6, 0.65, 0.72, 0.75])
 def test_damped_iteration_reaches_one_percent_within_eight_steps(radius):
-    worst, scenes = 0, 0
+    scenes = 0
     for name, texture, seed in GRID:
         if (truth := scene(name, radius, texture, seed)) is None:
             continue
@@ -68,9 +68,8 @@ def test_damped_iteration_reaches_one_percent_within_eight_steps(radius):
         assert found.spectral_radius == pytest.approx(radius, rel=0.01)
         np.testing.assert_allclose(found.albedo, albedo, rtol=0.01, err_msg=f"{name}, {texture}, {radius}")
         np.testing.assert_allclose(measured / found.irradiance, albedo, rtol=0.01)  # equation 8 with its light
-        worst, scenes = max(worst, found.steps), scenes + 1
+        scenes += 1
     assert scenes >= 6
-    print(f"spectral radius {radius}: {scenes} scenes, at most {worst} steps")
 
 
 @pytest.mark.parametrize(("radius", "converges"), [(0.3, True), (0.45, True), (0.52, False), (0.72, False)])

@@ -44,11 +44,12 @@ def fill_unseen(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     v4 = v.reshape(even[0] // 2, 2, even[1] // 2, 2, -1).sum((1, 3))
     coarse = fill_unseen(v4 / np.maximum(w4, 1e-12)[..., None], np.minimum(w4, 1.0))
     rows, columns = np.arange(height), np.arange(width)
-    up = _linear(_linear(coarse, (rows - 0.5) / 2, 0), (columns - 0.5) / 2, 1)
+    up = linear(linear(coarse, (rows - 0.5) / 2, 0), (columns - 0.5) / 2, 1)
     return values * weight[..., None] + up * (1 - weight[..., None])
 
 
-def _linear(values: np.ndarray, position: np.ndarray, axis: int) -> np.ndarray:
+def linear(values: np.ndarray, position: np.ndarray, axis: int) -> np.ndarray:
+    """Values at fractional indices ``position`` (K,) along an axis, linear between samples, the border repeated."""
     size = values.shape[axis]
     position = np.clip(position, 0, size - 1)
     low = np.minimum(position.astype(int), max(size - 2, 0))

@@ -1,0 +1,100 @@
+"""Albedo outside [0, 1]: probe and plate disagree about the light; by what factor, and what probably did it.
+
+Nothing diffuse reflects more than it gets, so an albedo above 1 says that the probe's light is too dark against the
+plate, or that the plate holds light that is not diffuse reflection. The causes leave different traces; the one that
+fits first is named. The factor is that on the map (or one over that on the plate) that brings 99 % of the texels to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.conventions import direction_from_latlong, latlong_solid_angles
+
+SIGMAS = 3.0  # by which a texel has to leave [0, 1] to count
+TOLERATED = 0.01  # share of the texels
+QUANTILE = 0.99
+COLOURED = 1.15  # ratio of the channels' factors that exposure cannot make
+UNKNOWN = 0.5  # relative uncertainty of a texel from which on its light is not known
+UNSURE = 0.02  # share of the irradiance from texels whose light is only a lower bound
+PATCHY = 0.1  # share of the texels above 1 up to which it is a highlight, not the scale
+DARK = 0.02  # 99 % quantile below which nothing real is as dark in all channels
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """Shares of texels outside [0, 1] beyond their noise, the curing factor on the map, and the likely cause.
+
+    ``cause`` is "" without disagreement; ``factor`` (3,) is 1 then.
+    """
+
+    above: float
+    below: float
+    factor: np.ndarray
+    cause: str
+
+
+def unsure_share(environment: np.ndarray, variance: np.ndarray | None, normal: np.ndarray, light: np.ndarray) -> float:
+    """Share of the irradiance on a plane that comes from texels (H, W, 3) known to 50 % at best: clipped, or filled.
+
+    ``variance`` (H, W, 3) is the map's, None counts as all known; ``light`` (3,): the irradiance.
+    """
+    if variance is None:
+        return 0.0
+    grey = environment.sum(-1)
+    rows, columns = np.nonzero(~(variance.sum(-1) < (UNKNOWN * grey) ** 2))
+    height, width = grey.shape
+    direction = direction_from_latlong((columns + 0.5) / width, (rows + 0.5) / height)
+    power = grey[rows, columns] * latlong_solid_angles(height, width)[rows, columns]
+    return float((power * np.maximum(direction @ normal, 0)).sum() / light.sum())
+
+
+def disagreement(albedo: np.ndarray, sigma: np.ndarray, unsure: float) -> Disagreement:
+    """What albedo (N, 3) with noise ``sigma`` (N, 3) says about the scale; ``unsure`` is that of `unsure_share`."""
+    above = float((albedo > 1 + SIGMAS * sigma).any(-1).mean())
+    below = float((albedo < -SIGMAS * sigma).any(-1).mean())
+    high = np.quantile(albedo, QUANTILE, axis=0)
+    if above > TOLERATED:
+        factor = np.full(3, max(high.max(), 1.0))
+        if high.max() > COLOURED * high.min() > 0 and high.min() < 1:
+            factor = np.maximum(high, 1.0)
+            cause = (
+                "only some channels exceed it: the ball's reflectance colour, or white balance between ball and plate"
+            )
+        elif unsure > UNSURE:
+            cause = (
+                f"{unsure:.0%} of the map's light is clipped or was not seen: a lamp's light is missing from the map"
+            )
+        elif above < PATCHY and np.median(albedo) < 0.6:
+            cause = "only a part of the plane exceeds it: a highlight, or a lamp so near that the ball saw it elsewhere"
+        else:
+            cause = (
+                "the whole plane exceeds it: exposure between plate and ball, or the ball's reflectance set too high"
+            )
+        return Disagreement(above, below, factor, cause)
+    if below > TOLERATED:
+        return Disagreement(above, below, np.ones(3), "black level of the plate, or veiling glare taken off twice")
+    if 0 < high.max() < DARK:
+        cause = "nothing is so dark: exposure between plate and ball, or the ball's reflectance set too low"
+        return Disagreement(above, below, np.full(3, float(high.max())), cause)
+    return Disagreement(above, below, np.ones(3), "")
+
+
+def warning(found: Disagreement, lowest: np.ndarray) -> str | None:
+    """One line about a disagreement; None without one. ``lowest`` (3,): 1 % quantile of the albedo."""
+    if not found.cause:
+        return None
+    if found.above > TOLERATED:
+        said = f"{found.above:.1%} of the seen texels exceed 1 beyond their noise, needed <= {TOLERATED:.0%}"
+    elif found.below > TOLERATED:
+        dark = ", ".join(f"{value:.3f}" for value in lowest)
+        return (
+            f"albedo: {found.below:.1%} of the seen texels lie below 0 beyond their noise (1 % quantile {dark}), "
+            f"needed <= {TOLERATED:.0%}; likely {found.cause}"
+        )
+    else:
+        said = f"99 % of the seen texels lie below {found.factor.max():.4f}"
+    factor = ", ".join(f"{value:.2f}" for value in found.factor)
+    return f"albedo: {said}; likely {found.cause}; a map ({factor}) times as bright would cure it"
