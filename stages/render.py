@@ -8,6 +8,7 @@ picture is there after seconds, and pixels leave when their noise is below half 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ import numpy as np
 from pipeline.camera.lens import ray_grid
 from pipeline.conventions import ACESCG
 from pipeline.image.colour import Space
+from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run import progress
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
-from pipeline.transport.estimate import Canvas, Effort, lit, pictures, prepare, sampled
+from pipeline.transport.estimate import Canvas, Effort, Shot, lit, prepare, sampled
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.region import limits_for
@@ -105,7 +107,8 @@ def compute(
     xn, dxn = ray_grid(camera)
     rays = Rays.of(views["plate"].world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
     plate = photographs["plate"]
-    noise = relative_noise(plate)
+    sigma = np.sqrt(plate.rgb("variance").astype(float).mean(-1))
+    white = 2.0 ** -display_exposure(plate.rgb())
     limits = limits_for(plate.rgb(), plate.rgb("variance"), params.threshold)
     effort = Effort(
         params.strategy, params.samples, params.depth, params.denoise, params.seed, adaptive=not params.light_groups
@@ -116,7 +119,7 @@ def compute(
         return worlds, irradiance(light, plane.normal[None])[0]
 
     worlds, light = worlds_under(environment.rgb(), emitters)
-    canvas, left = prepare(worlds, rays, shape, light, noise, limits, effort, tell)
+    canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, tell)
     if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
@@ -138,42 +141,48 @@ def compute(
 def refined(canvas: Canvas) -> Outcome:
     """Passes until nothing is open, shown as they come; goes on from a checkpoint; ends early when asked to."""
     saved = progress.checkpoint_load()
-    halves = None if saved is None else Halves.of_arrays(saved)
+    start = None if saved is None else Halves.of_arrays(saved)
+    shot = None if start is None else Shot(canvas, start)
     stopped = False
     try:
-        for halves in sampled(canvas, halves, tell("render")):  # noqa: B020  the last one is wanted
-            progress.offer(lambda halves=halves: offered(canvas, halves))  # type: ignore[misc]
+        for latest in sampled(canvas, start, tell("render")):
+            shot = latest
+            progress.offer(functools.partial(offered, shot))
             stopped = progress.interrupted()
-            progress.checkpoint_save(halves.arrays)
+            progress.checkpoint_save(shot.halves.arrays)
             if stopped:
                 break
     except Interrupted:
         stopped = True
-        if halves is None:
-            raise KeyboardInterrupt from None
-        progress.checkpoint_save(halves.arrays)
-    assert halves is not None
-    layers, numbers, warnings = outcome(canvas, halves)
-    if stopped and halves.open.any():
-        share = float(halves.both.count.sum() / (halves.both.count + halves.open * canvas.effort.samples).sum())
+    if shot is None:
+        raise KeyboardInterrupt
+    layers, numbers, warnings = outcome(shot)
+    if stopped and shot.halves.open.any():
+        progress.checkpoint_save(shot.halves.arrays)
+        done = shot.halves.both.count
+        share = float(done.sum() / (done + shot.halves.open * canvas.effort.samples).sum())
         numbers |= {"complete": False, "share_done": share}
         warnings = [*warnings, f"render: interrupted; about {share:.0%} of the samples are in the picture"]
     return layers, numbers, warnings
 
 
-def offered(canvas: Canvas, halves: Halves) -> Result:
+def offered(shot: Shot) -> Result:
     """What there is so far."""
-    layers, numbers, warnings = outcome(canvas, halves)
+    layers, numbers, warnings = outcome(shot)
     return Result({"layers": layers}, numbers, warnings)
 
 
-def outcome(canvas: Canvas, halves: Halves) -> Outcome:
+def outcome(shot: Shot) -> Outcome:
     """Layers, numbers and warnings of what has been sampled."""
-    images, numbers = pictures(canvas, halves)
-    numbers |= measure(canvas, halves)
+    images, quiet = shot.drawn
+    numbers = measure(shot.canvas, shot.halves)
+    if quiet is not None:
+        for name, part in (("shadow", quiet.survives), ("added_light", quiet.added), ("object", quiet.obj)):
+            numbers[f"raw_share_{name}"] = part.raw_share
+            numbers[f"speckle_share_{name}"] = part.speckle_share
     missing = numbers["not_finite_samples"]
     warnings = [f"render: {missing} samples were not finite and count as zero"] if missing else []
-    return to_layers(images, canvas.region.weight), numbers, warnings
+    return to_layers(images, shot.canvas.region.weight), numbers, warnings
 
 
 def groups(light: np.ndarray, emitters: list[Emitter]) -> dict[str, tuple[np.ndarray, list[Emitter]]]:
@@ -196,8 +205,8 @@ def by_group(canvases: dict[str, Canvas]) -> Outcome:
     numbers: dict[str, Any] = {}
     warnings: list[str] = []
     for name, canvas in canvases.items():
-        *_, halves = sampled(canvas, None, tell(f"render: {name}"))
-        layers, numbers, said = outcome(canvas, halves)
+        *_, shot = sampled(canvas, None, tell(f"render: {name}"))
+        layers, numbers, said = outcome(shot)
         warnings += said
         for layer in ("obj", "lost", "gained"):
             channels |= Raster.split(layers.rgb(layer), f"{layer}.{name}")
@@ -210,14 +219,6 @@ def by_group(canvases: dict[str, Canvas]) -> Outcome:
             total = Raster(summed, ACESCG)
     assert total is not None
     return Raster(total.channels | channels, ACESCG, {"insitu:groups": ",".join(canvases)}), numbers, warnings
-
-
-def relative_noise(photograph: Raster) -> np.ndarray:
-    """(H, W, 3) standard deviation over radiance; the median where it is unknown."""
-    rgb, variance = photograph.rgb().astype(float), photograph.rgb("variance").astype(float)
-    known = np.isfinite(variance) & (variance > 0) & (rgb > 0)
-    noise = np.sqrt(np.divide(variance, rgb**2, out=np.zeros_like(rgb), where=known))
-    return np.where(known, noise, np.median(noise[known]) if known.any() else 0.0)
 
 
 def empty_layers(shape: tuple[int, int]) -> Raster:

@@ -8,12 +8,12 @@ from pipeline.camera.lens import project, ray_grid
 from pipeline.conventions import HALF_PIXEL, invert_rigid, transform_points
 from pipeline.light.environment import irradiance
 from pipeline.transport.difference import difference_block
-from pipeline.transport.region import CELL, cell_pixels, interpolate, plan
+from pipeline.transport.region import CELL, LEAST, Limits, cell_pixels, interpolate, limits_for, plan
 from pipeline.transport.scene import build_worlds
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
-from pipeline.types import Camera, Plane, Raster
+from pipeline.types import Camera, Plane, Raster, Surface
 from stages import knobs, render
 
 MARKER_SIDE = 0.16
@@ -108,7 +108,7 @@ def test_region_bounds_what_it_leaves_out() -> None:
     light = irradiance(soft, np.array([[0.0, 1, 0]]))[0]
     index, grid = cell_pixels(96, 128)
     pilot = trace(difference_block, worlds, rays[index], 1024, 4, 1, CELL)
-    region = plan(pilot, grid, (96, 128), light, 0.01)
+    region, left = plan(pilot, pilot.albedo * light / np.pi, grid, (96, 128), Limits(0.01, 0.005, 0.01))
     full = trace(difference_block, worlds, rays, 1024, 4, 2)
     model = full.albedo * light / np.pi
     change = np.divide(full.lost + full.gained, model, out=np.zeros_like(model), where=model > 0).reshape(96, 128, 3)
@@ -117,8 +117,18 @@ def test_region_bounds_what_it_leaves_out() -> None:
     assert outside.any()
     assert region.interpolated.any()
     assert np.abs(change[outside]).max() < 0.01 + 5 * noise
+    assert left["left_out_max"] < 0.01
     error = np.abs(region.lost + region.gained - change)[region.interpolated & (region.weight == 1)]
     assert np.quantile(error, 0.99) < 0.01 / 2 + 3 * noise
+
+
+def test_the_threshold_follows_the_photographs_noise() -> None:
+    """White noise of 1 %: a quarter of the noise of 8 x 8 means is 1 % / 32; the user's threshold only lowers it."""
+    plate = np.full((40, 40, 3), 2.0)
+    noisy, clean = np.full(plate.shape, 0.02**2), np.full(plate.shape, 1e-16)
+    assert np.isclose(limits_for(plate, noisy, 0.004).threshold, 0.01 / 32)
+    assert limits_for(plate, noisy, 1e-5).threshold == 1e-5
+    assert limits_for(plate, clean, 0.004).threshold == LEAST
 
 
 def test_no_objects_give_empty_layers() -> None:
@@ -128,6 +138,11 @@ def test_no_objects_give_empty_layers() -> None:
         "environment": Raster(Raster.split(sky()), "acescg"),
         "plane": ground(),
         "albedo": Raster(Raster.split(np.full((4, 4, 3), 0.4)), "acescg"),
+        "photographs": {},
+        "emitters": [],
+        "surface": Surface(),
+        "local_proxies": [],
+        "occluders": [],
         "params": knobs.Render(samples=4),
     }
     result = render.compute(wishes={"object": []}, **everything)

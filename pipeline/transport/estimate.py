@@ -8,13 +8,22 @@ each other or gloss, E is the path-traced radiance without objects over the albe
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.transport.denoise import bounding_window, denoise
+from pipeline.transport.denoise import (
+    TILE,
+    Half,
+    QuietChange,
+    bounding_window,
+    denoise,
+    needs_more,
+    quieted,
+    tile_means,
+)
 from pipeline.transport.difference import difference_block
 from pipeline.transport.passes import Halves, refine
 from pipeline.transport.region import CELL, Limits, Region, cell_pixels, plan
@@ -23,9 +32,11 @@ from pipeline.transport.trace import Rays, Samples, Strategy, centre_albedo, ref
 
 STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
 PILOT_SHARE = 4  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
-TRUSTED = 8  # samples per half from which their variance says something
-LEAST_NOISE = 0.002  # of the radiance: quieter than this nobody asks for
-STOP_RATIO = 0.5  # of the photograph's noise
+TRUSTED = 16  # samples of a pixel and half from which noise is judged
+JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
+JUDGED = (
+    "obj", "lost", "gained", "albedo", "alpha", "obj_albedo", "obj_normal", "obj_variance", "change_variance",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,13 +60,22 @@ class Canvas:
     shape: tuple[int, int]
     region: Region
     light: np.ndarray
-    target: np.ndarray  # (H, W, 3) noise that is quiet enough, relative to the radiance
+    plate_sigma: np.ndarray  # (H, W) noise of the photograph, radiance; not finite where unknown
+    white: float  # radiance of display white
     effort: Effort
 
     @property
     def traced(self) -> np.ndarray:
         """Flat index of the pixels that are sampled."""
         return np.flatnonzero(self.region.traced)
+
+    @functools.cached_property
+    def smooth_albedo(self) -> np.ndarray:
+        """(H, W, 3) albedo where the change is interpolated, at the middle of the pixel; zero elsewhere."""
+        pixels = np.flatnonzero(self.region.interpolated)
+        image = np.zeros((self.region.traced.size, 3))
+        image[pixels] = centre_albedo(self.worlds, self.rays[pixels])
+        return image.reshape(*self.shape, 3)
 
     def light_at(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 3) or (3,) irradiance of the pixels."""
@@ -70,7 +90,8 @@ def prepare(
     rays: Rays,
     shape: tuple[int, int],
     light: np.ndarray,
-    target: np.ndarray,
+    plate_sigma: np.ndarray,
+    white: float,
     limits: Limits,
     effort: Effort,
     tell: Tell = lambda what: lambda share: None,
@@ -82,7 +103,8 @@ def prepare(
         rays: one per pixel of the photograph, in rows.
         shape: (H, W).
         light: (3,) irradiance on the plane under the distant light alone.
-        target: (H, W, 3) relative noise of the photograph.
+        plate_sigma: (H, W) noise of the photograph, radiance; not finite where unknown.
+        white: radiance of display white.
         limits: of the region.
         effort: what to spend.
         tell: gives a progress callback for a named task.
@@ -97,7 +119,7 @@ def prepare(
     region, left = plan(pilot, pilot.albedo * cell_light / np.pi, grid, shape, limits)
     if effort.strategy == "reference" or not effort.adaptive:
         region = replace(region, traced=region.weight > 0)
-    canvas = Canvas(worlds, rays, shape, region, light, target, effort)
+    canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort)
     return lit(canvas, worlds, light, tell), left
 
 
@@ -139,101 +161,113 @@ def received(
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     image = light.reshape(*shape, 3)[tuple(nearest)]
     guide = traced.albedo.reshape(*shape, 3)[tuple(nearest)]
-    return denoise(image, guide)[0].reshape(-1, 3).astype(float) if effort.denoise else image.reshape(-1, 3)
+    return denoise(image, guide).reshape(-1, 3) if effort.denoise else image.reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What there is after a pass; the pictures are made when somebody looks."""
+
+    canvas: Canvas
+    halves: Halves
+
+    @functools.cached_property
+    def drawn(self) -> tuple[dict[str, np.ndarray], QuietChange | None]:
+        """See `pictures`."""
+        return pictures(self.canvas, self.halves)
 
 
 def sampled(
     canvas: Canvas, start: Halves | None = None, progress: Callable[[float], None] = lambda share: None
-) -> Iterator[Halves]:
+) -> Iterator[Shot]:
     """Passes over the traced pixels; see `pipeline.transport.passes.refine`."""
-    effort, index = canvas.effort, canvas.traced
+    effort = canvas.effort
+
+    def noisy(halves: Halves, ahead: int) -> np.ndarray:
+        return still_noisy(canvas, halves, ahead) if effort.adaptive else halves.open
+
+    rays = canvas.rays[canvas.traced]
     strategy = STRATEGIES[effort.strategy]
-
-    def noisy(halves: Halves) -> np.ndarray:
-        return still_noisy(canvas, halves) if effort.adaptive else halves.open
-
-    yield from refine(
-        strategy,
-        canvas.worlds,
-        canvas.rays[index],
-        effort.samples,
-        effort.depth,
-        effort.seed + 2,
-        noisy,
-        start,
-        progress,
-    )
+    for halves in refine(
+        strategy, canvas.worlds, rays, effort.samples, effort.depth, effort.seed + 2, noisy, start, progress
+    ):
+        yield Shot(canvas, halves)
 
 
-def still_noisy(canvas: Canvas, halves: Halves) -> np.ndarray:
-    """(N,) of the traced pixels: whether their tile's noise is above half the photograph's."""
-    both = halves.both
-    model = both.albedo * canvas.light_at(canvas.traced) / np.pi
-    level = np.maximum(both.obj + model, 1e-12)
-    variance = both.obj_variance + both.change_variance
-    target = STOP_RATIO * np.maximum(canvas.target.reshape(-1, 3)[canvas.traced], LEAST_NOISE)
-    excess = variance / (level * target) ** 2
-    tiles = tile_means(excess.max(1), canvas.traced, canvas.shape)
-    return (tiles > 1) | (halves.a.count < TRUSTED)
+def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
+    """(N,) of the open pixels: whether the picture is noisier there than half of what the photograph hides.
+
+    Asked only where the samples still to come (``ahead``, of all pixels and one half) cost several times the answer.
+    """
+    window = bounding_window(scattered(canvas, halves.open))
+    area = np.zeros(canvas.shape)[window].size
+    if halves.a.count.max() < TRUSTED or ahead < JUDGE_SAMPLES * area:
+        return halves.open
+    images = planes_of(canvas, halves.both, JUDGED, window)
+    composite = (images["obj"] + images["without"] + images["lost"] + images["gained"]).mean(-1)
+    if canvas.effort.denoise:
+        noise = quiet_in(canvas, halves, images, window, fast=False).noise(tile_means(images["without"].mean(-1)))
+    else:
+        noise = np.sqrt(tile_means((images["obj_variance"] + images["change_variance"]).mean(-1)))
+    more = needs_more(noise, canvas.plate_sigma[window], tile_means(composite), canvas.white)
+    wanted = np.zeros(canvas.shape, bool)
+    inside = wanted[window]
+    inside[:] = np.repeat(np.repeat(more, TILE, 0), TILE, 1)[: inside.shape[0], : inside.shape[1]]
+    return wanted.ravel()[canvas.traced]
 
 
-def tile_means(values: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """(N,) mean over the pixels of the same `CELL` x `CELL` tile."""
-    rows, columns = np.divmod(pixels, shape[1])
-    tile = rows // CELL * (shape[1] // CELL + 1) + columns // CELL
-    total, count = np.bincount(tile, values), np.bincount(tile)
-    return (total / np.maximum(count, 1))[tile]
+def scattered(canvas: Canvas, values: np.ndarray) -> np.ndarray:
+    """Values (N, ...) of the traced pixels as a picture (H, W, ...), zero elsewhere."""
+    image = np.zeros((canvas.shape[0] * canvas.shape[1], *values.shape[1:]), values.dtype)
+    image[canvas.traced] = values
+    return image.reshape(*canvas.shape, *values.shape[1:])
 
 
-def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Every field as a picture (H, W, ...), zero where nothing was computed; and numbers of the denoiser."""
-    smooth = np.flatnonzero(canvas.region.interpolated)
-    samples = Samples.joined([interpolated(canvas, smooth), halves.both])
-    pixels = np.concatenate([smooth, canvas.traced])
-    variances = {"obj_variance": samples.obj_variance, "change_variance": samples.change_variance}
-    if len(smooth):
-        model = samples.albedo[: len(smooth)] * canvas.light_at(smooth) / np.pi
-        variances["change_variance"][: len(smooth)] = canvas.region.variance.reshape(-1, 3)[smooth] * model**2
-    images = {}
-    for name, values in ({f.name: getattr(samples, f.name) for f in fields(Samples)} | variances).items():
-        image = np.zeros((canvas.shape[0] * canvas.shape[1], *values.shape[1:]))
-        image[pixels] = values
-        images[name] = image.reshape(*canvas.shape, *values.shape[1:])
-    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)
-    images["without"] = images["albedo"] * light / np.pi  # equation 7
-    return quieted(images, canvas.region.traced) if canvas.effort.denoise else (images, {})
+def planes_of(
+    canvas: Canvas, samples: Samples, names: tuple[str, ...], window: tuple[slice, slice]
+) -> dict[str, np.ndarray]:
+    """The named fields as pictures of a window, and LS_noobj; the smooth part of the change is filled in."""
+    images = {name: scattered(canvas, getattr(samples, name))[window] for name in names}
+    gap = canvas.region.interpolated[window]
+    images["albedo"][gap] = canvas.smooth_albedo[window][gap]
+    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)[window]
+    images["without"] = model = images["albedo"] * light / np.pi  # equation 7
+    region = canvas.region
+    fill = {
+        "lost": (region.lost, model),
+        "gained": (region.gained, model),
+        "change_variance": (region.variance, model**2),
+    }
+    for name, (relative, scale) in fill.items():
+        if name in images:
+            images[name][gap] = relative[window][gap] * scale[gap]
+    if "ground" in images:
+        images["ground"][gap] = 1.0
+    return images
 
 
-def interpolated(canvas: Canvas, pixels: np.ndarray) -> Samples:
-    """The smooth part of the change as if it had been traced: relative change times LS_noobj of each pixel."""
-    albedo = centre_albedo(canvas.worlds, canvas.rays[pixels])
-    model = albedo * canvas.light_at(pixels) / np.pi
-    lost, gained = (field.reshape(-1, 3)[pixels] * model for field in (canvas.region.lost, canvas.region.gained))
-    return replace(Samples.none(len(pixels)), lost=lost, gained=gained, albedo=albedo, ground=np.ones(len(pixels)))
+def quiet_in(
+    canvas: Canvas, halves: Halves, images: dict[str, np.ndarray], window: tuple[slice, slice], fast: bool
+) -> QuietChange:
+    """The denoiser's work on a window; ``images`` holds both halves' alpha and guides there."""
+    parts = []
+    for samples in (halves.a, halves.b):
+        part = planes_of(canvas, samples, ("lost", "gained", "albedo", "obj"), window)
+        parts.append(Half(part["lost"], part["gained"], part["without"], part["obj"]))
+    return quieted(parts[0], parts[1], images["alpha"], images["obj_albedo"], images["obj_normal"], canvas.white, fast)
 
 
-def quieted(images: dict[str, np.ndarray], traced: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Lost and gained light and the object layer, denoised; the pictures, and how much light was in speckles."""
-    from scipy.ndimage import distance_transform_edt
-
-    window = bounding_window(traced)
+def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], QuietChange | None]:
+    """Every field as a picture (H, W, ...), zero where nothing was computed; and what the denoiser says of its work."""
+    images = planes_of(canvas, halves.both, (*JUDGED, "ground"), (slice(None), slice(None)))
+    if not canvas.effort.denoise:
+        return images, None
+    window = bounding_window(canvas.region.traced)
     view = {name: image[window] for name, image in images.items()}
-    model, shown = view["without"], view["alpha"][..., None]
-    bare = (model > 0).all(-1)
-    # Below an object the ground's values continue, so that its outline is no edge of theirs.
-    nearest = distance_transform_edt(~bare, return_distances=False, return_indices=True) if bare.any() else None
-
-    def relative(part: np.ndarray) -> np.ndarray:
-        ratio = np.divide(part, model, out=np.zeros_like(part), where=model > 0)
-        return ratio if nearest is None else ratio[tuple(nearest)]
-
-    guide = np.repeat(view["ground"][..., None], 3, -1)
-    survives, _ = denoise(np.maximum(1 + relative(view["lost"]), 0), guide)
-    added, moved = denoise(relative(view["gained"]), guide)
-    obj, moved_obj = denoise(view["obj"], view["obj_albedo"], view["obj_normal"])
-    result = {name: image.copy() for name, image in images.items() if name in ("lost", "gained", "obj")}
-    here = traced[window][..., None]
-    result["lost"][window] = np.where(here, np.minimum(survives - 1, 0) * model, view["lost"])
-    result["gained"][window] = np.where(here, added * model, view["gained"])
-    result["obj"][window] = np.where(shown > 0, obj, view["obj"])
-    return images | result, {"speckle_light_moved_change": moved, "speckle_light_moved_object": moved_obj}
+    quiet = quiet_in(canvas, halves, view, window, fast=halves.a.count.max() < TRUSTED)
+    here, model = canvas.region.traced[window][..., None], view["without"]
+    ground, shown = here & (model > 0), here & (view["alpha"][..., None] > 0)
+    view["lost"][:] = np.where(ground, np.minimum(quiet.survives.rgb - 1, 0) * model, view["lost"])
+    view["gained"][:] = np.where(ground, quiet.added.rgb * model, view["gained"])
+    view["obj"][:] = np.where(shown, quiet.obj.rgb, view["obj"])
+    return images, quiet

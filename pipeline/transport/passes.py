@@ -74,7 +74,7 @@ def refine(
     samples: int,
     depth: int,
     seed: int,
-    noisy: Callable[[Halves], np.ndarray],
+    noisy: Callable[[Halves, int], np.ndarray],
     start: Halves | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Halves]:
@@ -87,7 +87,8 @@ def refine(
         depth: of the paths, as `pipeline.transport.trace.trace` takes it.
         seed: of the first pass.
         samples: most samples per pixel; pixels that show an object may take `OBJECT_BOOST` times as many.
-        noisy: (N,) bool, the pixels whose noise still matters, asked between passes.
+        noisy: (N,) bool, the pixels whose noise still matters, asked between passes with the number of samples still to
+            come if none leaves, of one half.
         start: where an earlier run stopped. The result is the same to the byte as without stopping.
         progress: told the share of samples done; may raise `Interrupted`.
     """
@@ -98,9 +99,7 @@ def refine(
         index = np.flatnonzero(halves.open)
         if not len(index):
             return
-        on_object = (halves.a.alpha + halves.b.alpha)[index] > 0
-        sizes = [len(index) if later < plain else on_object.sum() for later in range(number, len(steps))]
-        ahead = sum(size * step for size, step in zip(sizes, steps[number:], strict=True)) or 1
+        ahead = _ahead(halves.open, (halves.a.alpha + halves.b.alpha) > 0, steps, plain, number) or 1
         tells = [_part(progress, spent, len(index) * steps[number], ahead, half) for half in range(2)]
         a, b = (
             part.placed(
@@ -115,9 +114,18 @@ def refine(
         on_object = (a.alpha + b.alpha) > 0
         left = np.full(len(rays), number + 1 < plain) | (on_object & (number + 1 < len(steps)))
         halves = Halves(a, b, number + 1, halves.open & left)
-        if halves.open.any() and number + 1 < len(steps):
-            halves = replace(halves, open=halves.open & noisy(halves))
+        ahead = _ahead(halves.open, on_object, steps, plain, number + 1)
+        if ahead:
+            halves = replace(halves, open=halves.open & noisy(halves, ahead))
         yield halves
+
+
+def _ahead(still: np.ndarray, on_object: np.ndarray, steps: list[int], plain: int, number: int) -> int:
+    """Samples of one half from pass ``number`` on, if no pixel leaves early."""
+    objects = int((still & on_object).sum())
+    return sum(
+        step * (int(still.sum()) if later < plain else objects) for later, step in enumerate(steps) if later >= number
+    )
 
 
 def _part(
