@@ -19,6 +19,7 @@ from pipeline.run.cli import at_work
 from pipeline.run.derive import print_summary
 from pipeline.run.live import Live, Pace, Stop
 from pipeline.types import Result
+from stages.order import graph
 
 
 @pytest.fixture(autouse=True)
@@ -209,10 +210,30 @@ def test_nothing_follows_while_another_process_works_there(tmp_path):
         assert one.run(one.graph["mean"]) == "ran"
 
 
+def test_composite_follows_the_render():
+    composite = graph()["composite"]
+    assert composite.live
+    assert graph()["render"] in graph().parents(composite)
+
+
 def test_nothing_follows_whose_other_inputs_are_missing(tmp_path):
     one = toy.build(tmp_path)
     assert one.run(one.graph["mean"]) == "ran"
     assert not (tmp_path / "seen").exists()
+
+
+def test_seconds_before_the_checkpoint_count(tmp_path):
+    """10 s, a checkpoint, 5 s lost with the process; then 2 s from the checkpoint on."""
+    clock, arguments = Clock(), ("toy", Stop(), tmp_path / "checkpoint.npz", "digest", lambda result, seen: None)
+    host = Live(*arguments, clock)
+    clock.now += 10
+    host.checkpoint_save(lambda: {"total": np.ones(3)})
+    clock.now += 5
+    host = Live(*arguments, clock)
+    loaded = host.checkpoint_load()
+    assert list(loaded) == ["total"]
+    clock.now += 2
+    assert host.spent()[0] == pytest.approx(12)
 
 
 class Clock:

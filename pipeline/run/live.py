@@ -22,7 +22,7 @@ from pipeline.types import Result
 
 OFFER_EVERY_S, OFFER_SHARE = 3.0, 0.1
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.05
-DIGEST = "insitu:digest"  # key of the checkpoint's own digest beside the stage's arrays
+DIGEST, SPENT = "insitu:digest", "insitu:spent"  # keys of the checkpoint's own beside the stage's arrays
 
 
 class Stop:
@@ -90,6 +90,11 @@ class Live(progress.Host):
         self.offers = Pace(OFFER_EVERY_S, OFFER_SHARE, self.start)
         self.saves = Pace(SAVE_EVERY_S, SAVE_SHARE, self.start + SAVE_EVERY_S)
         self.shown = self.told = False
+        self.cpu_start, self.before = time.process_time(), np.zeros(2)
+
+    def spent(self) -> np.ndarray:
+        """(2,) wall and CPU seconds of the stage, those before the checkpoint it went on from included."""
+        return self.before + np.array([self.clock() - self.start, time.process_time() - self.cpu_start])
 
     def offer(self, make: Callable[[], Result]) -> None:
         """Show the result when one is due."""
@@ -120,14 +125,17 @@ class Live(progress.Host):
                 arrays = {key: file[key] for key in file.files}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
-        return arrays if str(arrays.pop(DIGEST, "")) == self.digest else None
+        if str(arrays.pop(DIGEST, "")) != self.digest:
+            return None
+        self.before = arrays.pop(SPENT)
+        return arrays
 
     def checkpoint_save(self, make: Callable[[], progress.Arrays]) -> None:
         """Write the arrays when that is due, or when the stage is about to stop."""
         start = self.clock()
         if not self.saves.due(start) and not self.interrupted():
             return
-        arrays = {**make(), DIGEST: np.array(self.digest)}
+        arrays = {**make(), DIGEST: np.array(self.digest), SPENT: self.spent()}
         with formats.atomic_path(self.checkpoint) as scratch, scratch.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
         self.saves.spent(start, self.clock())

@@ -127,11 +127,11 @@ class Build:
         if old and not stage.impure and self._is_fresh(stage, wanted, old):
             os.utime(self.out / stage.name / "record.json")
             return "fresh"
-        start, cpu = time.perf_counter(), time.process_time()
         folder = self.out / stage.name
         checkpoint = folder / "checkpoint.npz"
         show = functools.partial(self._show, stage)
-        with progress.hosted(Live(stage.name, self.stop, checkpoint, _digest_of(wanted), show)):
+        live = Live(stage.name, self.stop, checkpoint, _digest_of(wanted), show)
+        with progress.hosted(live):
             try:
                 result = self._compute(stage)
             finally:
@@ -143,7 +143,7 @@ class Build:
         for artifact in stage.outputs.values():
             outputs[artifact.name] = formats.digest(formats.write(folder, artifact, values[artifact.name]))
             self.memory[artifact.name] = outputs[artifact.name], values[artifact.name]
-        seconds = {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
+        seconds = dict(zip(("seconds", "cpu_seconds"), live.spent().tolist(), strict=True))
         measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
         changed = old is None or old.get("outputs") != outputs
         record = wanted | {"outputs": outputs} | seconds | measured
