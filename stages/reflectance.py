@@ -4,8 +4,9 @@ The plate is read at every texel of the modelled rectangle through the lens, noi
 does not show, or shows clipped, or that a proxy hides, continue their surroundings and are marked in ``seen``. A plane
 alone under distant light needs one step. With proxies their shadows are divided out and their bounced light is taken
 off, by the gathered form or the damped iteration (`pipeline.transport.radiosity`); their own albedo is measured too.
-Limits: proxies are diffuse; a shadow that nothing modelled explains stays in the albedo, and the ratio composite undoes
-it again.
+Shadows of compact lights that nothing modelled casts are looked for and masked (`pipeline.transport.shadows`); gloss is
+taken up when held-out cells ask for it (`pipeline.transport.specular`). Limits: proxies are diffuse; a shadow that is
+not found stays in the albedo, and the ratio composite undoes it again.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pipeline.transport.plate_texture import read_plate, shrunk, texture_size, w
 from pipeline.transport.radiosity import Estimate
 from pipeline.transport.reflectance import fill_unseen, updated_brdf
 from pipeline.transport.scale import disagreement, unsure_share, warning
+from pipeline.transport.shadows import Found, darkening, unexplained
 from pipeline.transport.specular import base_of, cells_of, climb, explain
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
@@ -78,6 +80,15 @@ def compute(
         if surface.model != "diffuse":
             measured = base_of(surface, values, environment.rgb(), plane.normal, points, eye)
             known &= np.isfinite(measured).all(-1)
+    ratios = darkening(emitters, plane.normal, alone)
+    shadow = unexplained(measured, known, ratios)
+    if shadow.lights:
+        known &= ~shadow.mask
+        seen = np.where(shadow.mask, 0.0, seen)
+        warnings.append(
+            f"plate: {shadow.fraction:.1%} of the seen plane lies in a shadow of {', '.join(shadow.lights)} that nothing "
+            "modelled casts; the albedo there continues its surroundings. Describe what casts it as a [[proxy]]"
+        )
     sigma = np.pi * updated_brdf(np.sqrt(kept * texture.variance), light)
     variance = environment.rgb("variance") if "variance.R" in environment.channels else None
     unsure = unsure_share(environment.rgb(), variance, plane.normal, alone)
@@ -101,6 +112,7 @@ def compute(
         "below_zero_fraction": scale.below,
         "map_factor": scale.factor,
         "uncertain_light": unsure,
+        "unexplained_shadow_fraction": shadow.fraction,
         "limited_texels": int(((albedo < 0) | (albedo > HIGHEST)).any(-1).sum()),
         "detail_kept": float(kept[known].mean()),
         "texel_mm": float(1e3 * np.linalg.norm(plane.corners_m[1] - plane.corners_m[0]) / shape[1]),
@@ -110,6 +122,7 @@ def compute(
     terms = [
         texture_evidence(params.model, numbers["detail_kept"]),
         bounce_evidence(near.estimate if near else None),
+        shadow_evidence(list(ratios), shadow),
         explain(surface),
     ]
     outputs = {"albedo": raster, "surface": surface, "local_proxies": local_proxies}
@@ -123,6 +136,24 @@ def texture_evidence(model: str, kept: float) -> dict[str, Any]:
         "modelled": model == "textured",
         "because": f"knob reflectance.model = {model}; {kept:.0%} of the texels' own detail is kept, the rest is noise",
         "could_cost": "wrong reflections of the ground in shiny objects",
+    }
+
+
+def shadow_evidence(asked: list[str], found: Found) -> dict[str, Any]:
+    """Which shadows in the plate were looked for, and what was done about them."""
+    if not asked:
+        because = "no compact light gives enough of the plane's light to be missed where it is hidden"
+    elif not found.lights:
+        because = f"no step on the plane has the length and colour of a hidden {' or '.join(asked)}"
+    else:
+        because = (
+            f"steps as of a hidden {' and '.join(found.lights)} around {found.fraction:.1%} of what is seen: masked"
+        )
+    return {
+        "term": "shadows in the plate that nothing modelled casts",
+        "modelled": bool(found.lights),
+        "because": because,
+        "could_cost": "soft shadows and shadows on fine texture are taken for albedo, which the ratio composite undoes",
     }
 
 
