@@ -17,6 +17,8 @@ import pytest
 from pipeline.run import closure, formats, live
 from pipeline.run.cli import at_work
 from pipeline.run.derive import print_summary
+from pipeline.run.errors import ArtifactError
+from pipeline.run.figures import read_build
 from pipeline.run.live import Live, Pace, Stop
 from pipeline.types import Result
 from stages.order import graph
@@ -183,6 +185,25 @@ def test_interrupted_command_says_what_is_kept_and_how_to_go_on(tmp_path, capsys
     assert said.err == "insitu: interrupted; mean kept at 50%; run the same command to go on from there\n"
     toy.happens[0] = toy.nothing_happens
     assert at_work(args, toy.build(tmp_path), "seen") == 0
+
+
+def test_figures_are_of_whole_builds(tmp_path):
+    at(3, signal.SIGINT)
+    toy.run(toy.build(tmp_path))
+    for name in ("evaluate/metrics", "ingest/facts", "settings"):
+        formats.write_bytes(tmp_path / f"{name}.json", b'{"name": "toy", "quality": "draft"}')
+    with pytest.raises(ArtifactError, match="mean was interrupted"):
+        read_build(tmp_path)
+    toy.happens[0] = toy.nothing_happens
+    toy.run(toy.build(tmp_path))
+    assert read_build(tmp_path)["name"] == "toy"
+
+
+def test_what_a_killed_writer_left_is_removed(tmp_path):
+    (tmp_path / "mean/.mean.exr.a1b2c3").mkdir(parents=True)
+    (tmp_path / "mean/.mean.exr.a1b2c3/mean.exr").write_bytes(b"half")
+    toy.run(toy.build(tmp_path))
+    assert {path.name for path in (tmp_path / "mean").iterdir()} == {"mean.exr", "record.json", ".lock"}
 
 
 def test_summary_says_what_is_incomplete(tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.run.errors import ArtifactError
+from pipeline.run.runner import is_complete
 
 COLUMNS = {
     "object_rel_err": "object",
@@ -38,6 +39,8 @@ def read_build(folder: Path) -> dict[str, Any]:
         records = [json.loads(path.read_bytes()) for path in folder.glob("*/record.json")]
     except (FileNotFoundError, json.JSONDecodeError) as error:
         raise ArtifactError(f"{folder}: not a finished build ({error}); insitu run --out {folder} makes it") from error
+    if part := [record["stage"] for record in records if not is_complete(record)]:
+        raise ArtifactError(f"{folder}: {', '.join(part)} was interrupted; insitu run --out {folder} completes it")
     return {
         "name": facts["name"],
         "quality": settings["quality"],

@@ -19,6 +19,7 @@ import importlib.metadata
 import json
 import logging
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -128,6 +129,8 @@ class Build:
             os.utime(self.out / stage.name / "record.json")
             return "fresh"
         folder = self.out / stage.name
+        for scratch in folder.glob(".*/"):
+            shutil.rmtree(scratch)  # of a process that was killed while writing; ours begin only now
         checkpoint = folder / "checkpoint.npz"
         show = functools.partial(self._show, stage)
         live = Live(stage.name, self.stop, checkpoint, _digest_of(wanted), show)
