@@ -34,6 +34,7 @@ class Raster:
     """A picture on disk: named float32 or uint32 channels of one size, and its header.
 
     ``channels``: name -> (H, W). Names follow OpenEXR: ``R G B``, ``variance.R`` ..., ``mask`` (uint32), ``Y``.
+    An array of float16 is stored as such, and read back as float32.
     ``space``: ``acescg``, ``camera_rgb`` or ``data``. ``attributes``: str, int, float or matrices for the EXR header.
     """
 

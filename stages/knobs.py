@@ -93,7 +93,9 @@ class Composite(Params):
     kind: Literal["additive", "ratio", "auto"] = Field("auto", description="equation 4, 5, or chosen per pixel")
     view: str = Field("ACES 2.0 - SDR 100 nits (Rec.709)", description="OCIO view of the display picture")
     display: str = Field("sRGB - Display", description="OCIO display")
+    look: str = Field("", description="OCIO look or looks of the display picture; empty takes the view's own")
     exposure_ev: float = Field(0.0, ge=-20, le=20, description="over automatic display exposure [EV]")
+    half: bool = Field(False, description="store the factor on the plate (mul) as 16-bit floats")
 
 
 class Evaluate(Params):

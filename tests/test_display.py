@@ -74,6 +74,16 @@ roles: {aces_interchange: ap0, cie_xyz_d65_interchange: xyz, default: ap0}
 displays:
   Box:
     - !<View> {name: Plain, colorspace: coded}
+    - !<View> {name: Dim, colorspace: coded, looks: half}
+looks:
+  - !<Look>
+    name: half
+    process_space: ap0
+    transform: !<MatrixTransform> {matrix: [0.5,0,0,0, 0,0.5,0,0, 0,0,0.5,0, 0,0,0,1]}
+  - !<Look>
+    name: red
+    process_space: ap0
+    transform: !<MatrixTransform> {matrix: [1,0,0,0, 0,0,0,0, 0,0,0,0, 0,0,0,1]}
 colorspaces:
   - !<ColorSpace> {name: ap0}
   - !<ColorSpace> {name: coded, from_scene_reference: !<ExponentTransform> {value: 2, direction: inverse}}
@@ -89,6 +99,55 @@ def test_config_without_acescg_uses_the_interchange_role(monkeypatch, tmp_path):
     rgb = np.random.default_rng(3).random((8, 8, 3))
     expected = np.round(255 * np.sqrt((rgb @ display.AP0_FROM_AP1.T).clip(0, 1)))
     assert np.abs(display.display_transform(rgb, "Box", "Plain") - expected).max() <= 1
+
+
+@pytest.fixture
+def own_config(monkeypatch, tmp_path):
+    path = tmp_path / "small.ocio"
+    path.write_text(SMALL_CONFIG)
+    monkeypatch.setenv("OCIO", str(path))
+
+
+def own(rgb):
+    return np.round(255 * np.sqrt((rgb @ display.AP0_FROM_AP1.T).clip(0, 1)))
+
+
+def test_looks_of_the_users_config(own_config):
+    """A look takes the place of the view's own; a view's own holds without one; several in OCIO's notation."""
+    rgb = np.random.default_rng(3).random((8, 8, 3))
+    red = own(rgb) * (1, 0, 0)
+    for view, look, expected in (
+        ("Plain", "half", own(rgb / 2)),
+        ("Dim", "", own(rgb / 2)),
+        ("Dim", "red", red),
+        ("Plain", "-half", own(rgb * 2)),
+        ("Plain", "half, +red", own(rgb / 2) * (1, 0, 0)),
+        ("Plain", "half,-half", own(rgb)),
+    ):
+        assert np.abs(display.display_transform(rgb, "Box", view, look=look) - expected).max() <= 1, (view, look)
+
+
+@pytest.mark.parametrize("look", ["sepia", "half, sepia", "-sepia"])
+def test_an_unknown_look_lists_what_there_is(own_config, look):
+    with pytest.raises(ManifestError, match=r"composite.look.*half.*red.*sepia"):
+        display.display_transform(np.zeros((1, 1, 3)), "Box", "Plain", look=look)
+
+
+def test_the_users_config_names_the_displays_and_the_pinned_one_is_the_fallback(own_config, monkeypatch):
+    assert display.display_views() == {"Box": ["Plain", "Dim"]}
+    with pytest.raises(ManifestError, match=r"composite.display: is 'sRGB - Display'.*Box"):
+        display.display_transform(np.zeros((1, 1, 3)))
+    monkeypatch.delenv("OCIO")
+    assert display.config_name() == display.BUILTIN_CONFIG
+    assert display.DISPLAY in display.display_views()
+
+
+def test_the_built_in_gamut_compression_is_a_look():
+    """It leaves colours inside the gamut alone and brings a blue outside it back, before the view."""
+    grey, blue = np.full((1, 1, 3), 0.3), np.array([[[-0.1, -0.05, 0.8]]])
+    look = "ACES 1.3 Reference Gamut Compression"
+    assert np.array_equal(display.display_transform(grey, look=look), display.display_transform(grey))
+    assert not np.array_equal(display.display_transform(blue, look=look), display.display_transform(blue))
 
 
 def test_auto_exposure_follows_exposure():

@@ -6,7 +6,6 @@ import pytest
 from pipeline.camera.lens import ray_grid
 from pipeline.conventions import direction_from_latlong, latlong_directions
 from pipeline.light.environment import irradiance
-from pipeline.transport import differential
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.reflectance import fill_unseen, reflected_radiance, updated_brdf
@@ -181,57 +180,6 @@ def test_envmap_grid_keeps_a_constant_and_the_poles() -> None:
     grid = envmap_grid(ramp)
     assert grid.shape == (9, 16, 3)
     np.testing.assert_allclose(grid[1:-1, 0, 0], np.arange(7) + 0.5)  # rows of the corner grid lie between ours
-
-
-def change(difference: float, alpha: float = 0.0) -> differential.Change:
-    shape = (4, 5)
-    return differential.Change(
-        obj=np.full((*shape, 3), 0.2 * alpha),
-        alpha=np.full(shape, alpha),
-        lost=np.full((*shape, 3), min(difference, 0.0) * (1 - alpha)),
-        gained=np.full((*shape, 3), max(difference, 0.0) * (1 - alpha)),
-        without=np.full((*shape, 3), 0.5 * (1 - alpha)),
-        ground=np.full(shape, 1 - alpha),
-    )
-
-
-def test_composite_forms_on_known_cases() -> None:
-    """A shadow of half the light on a plate 20 % brighter than the model: ratio and chosen halve it."""
-    plate = np.full((4, 5, 3), 0.6, np.float32)
-    shadow = change(-0.25)
-    np.testing.assert_allclose(differential.additive(shadow).apply(plate), 0.35, rtol=1e-6)
-    np.testing.assert_allclose(differential.ratio(shadow).apply(plate), 0.30, rtol=1e-6)
-    np.testing.assert_allclose(differential.chosen(shadow, plate).apply(plate), 0.30, rtol=1e-6)
-    light = change(0.1)
-    np.testing.assert_allclose(differential.additive(light).apply(plate), 0.70, rtol=1e-6)
-    np.testing.assert_allclose(differential.chosen(light, plate).apply(plate), 0.6 + 0.1 * 1.2, rtol=1e-6)
-    half = change(-0.25, alpha=0.5)
-    np.testing.assert_allclose(differential.ratio(half).apply(plate), 0.6 * (0.5 + 0.5 * -0.5) + 0.1, rtol=1e-6)
-
-
-def test_insert_nothing_returns_the_plate_bit_for_bit() -> None:
-    plate = np.random.default_rng(0).normal(0, 1, (4, 5, 3)).astype(np.float32)
-    plate[0, 0] = np.nan
-    plate[1, 1] = -0.0
-    for layers in (
-        differential.additive(change(0.0)),
-        differential.ratio(change(0.0)),
-        differential.chosen(change(0.0), plate),
-    ):
-        assert layers.apply(plate).tobytes() == plate.tobytes()
-        assert not layers.guards.any()
-
-
-def test_gain_is_bounded_and_black_models_fall_back() -> None:
-    plate = np.full((4, 5, 3), 100.0, np.float32)
-    bright = differential.chosen(change(0.1), plate)
-    np.testing.assert_allclose(bright.apply(plate), 100 + 0.1 * differential.GAIN_RANGE[1], rtol=1e-6)
-    assert np.all(bright.guards & differential.GAIN_LIMITED)
-    black = change(0.1)
-    dark = differential.Change(black.obj, black.alpha, black.lost, black.gained, black.without * 0, black.ground)
-    for layers in (differential.ratio(dark), differential.chosen(dark, plate)):
-        assert np.all(layers.guards & differential.NO_MODEL)
-        assert np.all(np.isfinite(layers.apply(plate)))
 
 
 def test_equations_6_to_8() -> None:

@@ -7,6 +7,7 @@ library). Display pictures are leaves: nothing reads them back.
 from __future__ import annotations
 
 import os
+import re
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
@@ -21,6 +22,7 @@ DISPLAY = "sRGB - Display"
 VIEW = "ACES 2.0 - SDR 100 nits (Rec.709)"
 MID_GREY = 0.18
 DIFFUSE_WHITE = 0.9
+LOOK_MARKS = re.compile(r"[,:|]|(?:(?<=[,:|\s])|^)\s*[+-]")  # between looks, or for the direction of one
 THREADS = 2  # the processor releases the GIL: two row blocks take half the time of one
 
 # AP1 -> AP0, S-2014-004 (ACEScg), appendix A; only for configs that know ACES2065-1 and not ACEScg.
@@ -68,14 +70,15 @@ def _exposure(rgb: np.ndarray, quantile: float, target: float) -> float:
 
 
 def display_transform(
-    rgb: np.ndarray, display: str = DISPLAY, view: str = VIEW, exposure_ev: float = 0.0
+    rgb: np.ndarray, display: str = DISPLAY, view: str = VIEW, exposure_ev: float = 0.0, look: str = ""
 ) -> np.ndarray:
     """Display picture (H, W, 3) uint8 of scene-linear ACEScg (H, W, 3).
 
-    Values outside the display are clipped here and nowhere before; non-finite pixels come out magenta.
-    Raises ManifestError with the valid names when the config has no such display or view.
+    Values outside the display are clipped here and nowhere before; non-finite pixels come out magenta. ``look``, one
+    or several in OCIO's own notation (``grade, -print``), stands in for the looks of the view; empty keeps those.
+    Raises ManifestError with the valid names when the config has no such display, view or look.
     """
-    processor = _processor(config_name(), display, view)
+    processor = _processor(config_name(), display, view, look)
     picture = np.array(rgb, np.float32, order="C", copy=True)
     bad = ~np.isfinite(picture).all(-1)
     picture *= np.float32(2.0**exposure_ev)
@@ -102,7 +105,7 @@ def _config(name: str) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _processor(name: str, display: str, view: str) -> Any:
+def _processor(name: str, display: str, view: str, look: str) -> Any:
     import PyOpenColorIO as ocio
 
     config, views = _config(name), display_views(name)
@@ -110,6 +113,10 @@ def _processor(name: str, display: str, view: str) -> Any:
         raise ManifestError(f"composite.display: is {display!r}; {name} has {sorted(views)}")
     if view not in views[display]:
         raise ManifestError(f"composite.view: is {view!r}; {display!r} of {name} has {views[display]}")
+    looks = [one.strip() for one in LOOK_MARKS.split(look) if one.strip()]
+    if unknown := [one for one in looks if config.getLook(one) is None]:
+        known = [one.getName() for one in config.getLooks()]
+        raise ManifestError(f"composite.look: is {look!r}; {name} has {known or 'no looks'}, not {unknown}")
     chain = ocio.GroupTransform()
     if config.getColorSpace("ACEScg") is not None:
         source = "ACEScg"
@@ -120,5 +127,7 @@ def _processor(name: str, display: str, view: str) -> Any:
         chain.appendTransform(ocio.MatrixTransform(matrix=matrix.ravel().tolist()))
     else:
         raise ManifestError(f"OCIO: {name!r} has neither ACEScg nor the role aces_interchange; use another config")
-    chain.appendTransform(ocio.DisplayViewTransform(src=source, display=display, view=view))
+    if looks:
+        chain.appendTransform(ocio.LookTransform(src=source, dst=source, looks=look))
+    chain.appendTransform(ocio.DisplayViewTransform(src=source, display=display, view=view, looksBypass=bool(looks)))
     return config.getProcessor(chain).getDefaultCPUProcessor()

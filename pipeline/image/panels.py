@@ -24,7 +24,8 @@ UNTOUCHED = (24, 25, 27)
 GUARDS = {
     d.NEGATIVE: ((232, 80, 70), "below zero"), d.CLIPPED_PLATE: ((240, 160, 60), "plate clipped"),
     d.GAIN_LIMITED: ((120, 190, 90), "gain limited"), d.NO_MODEL: ((80, 160, 220), "no model"),
-    d.BOUNDED: ((170, 110, 210), "ratio bounded"),
+    d.BOUNDED: ((170, 110, 210), "ratio bounded"), d.EDGE_OF_MODEL: ((230, 230, 120), "edge of the model"),
+    d.UNSEEN_ALBEDO: ((120, 210, 200), "albedo not seen"),
 }  # fmt: skip
 KINDS = [((24, 25, 27), "unchanged"), ((250, 170, 52), "object"), ((90, 140, 230), "shadow"),
          ((60, 80, 120), "faint shadow"), ((172, 49, 88), "edge")]  # fmt: skip

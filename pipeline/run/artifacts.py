@@ -72,7 +72,7 @@ COMPOSITE = Artifact(
     "composite",
     "raster",
     "the photograph with the objects: R G B, and the layers mul, add, obj with "
-    "plate * mul + add + obj = result; guards (uint32)",
+    "plate * mul + add + obj = result, also per light when the render keeps them apart; guards (uint32)",
     RADIANCE_UNIT,
     ACESCG,
 )

@@ -46,7 +46,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
-    """Write a single-part scanline EXR, float32 (or half) and uint32 channels, ZIP.
+    """Write a single-part scanline EXR, ZIP: uint32 and float16 arrays as they are, all others float32 (or half).
 
     Raises ValueError when channels differ in size. OpenEXR writes wrong pixels from non-contiguous arrays, so every
     channel is made contiguous first.
@@ -56,9 +56,10 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
     shapes = {values.shape for values in raster.channels.values()}
     if len(shapes) != 1:
         raise ValueError(f"{path}: channels of different sizes {sorted(shapes)}")
+    kept = {np.dtype(np.uint32), np.dtype(np.float16)}
     float_type = np.float16 if half else np.float32
     channels = {
-        name: np.ascontiguousarray(values, values.dtype if values.dtype == np.uint32 else float_type)
+        name: np.ascontiguousarray(values, values.dtype if values.dtype in kept else float_type)
         for name, values in raster.channels.items()
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **raster.attributes}
