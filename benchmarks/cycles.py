@@ -10,6 +10,7 @@ import json
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def write_scene(scene: Scene, wanted: list[Wanted], folder: Path, threads: int) 
     plain = {"kind": "diffuse", "color": [1, 1, 1], "alpha": 0.0, "ior": 1.0, "texture": "", "catcher": False}
     meshes = []
 
-    def add(name: str, arrays: dict[str, np.ndarray], **facts: object) -> None:
+    def add(name: str, arrays: dict[str, Any], **facts: object) -> None:
         np.savez(folder / f"{name}.npz", **arrays)
         meshes.append({**plain, "name": name, "file": f"{name}.npz", **facts})
 
@@ -105,7 +106,7 @@ def write_scene(scene: Scene, wanted: list[Wanted], folder: Path, threads: int) 
     for wall in scene.walls:
         add(wall.name, {"vertices": wall.vertices, "faces": wall.faces}, color=list(wall.albedo), catcher=True)
     for item in scene.items:
-        arrays = {"vertices": item.vertices, "faces": item.faces, "normals": item.normals}
+        arrays = vars(item.shape)
         add(item.name, arrays, kind=item.kind, color=list(item.color), alpha=item.alpha, ior=item.ior)
     job = {
         "width": scene.camera.width,

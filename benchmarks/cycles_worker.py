@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 BLENDER_FROM_WORLD = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
 
 
-def material(name, kind, color, alpha, ior, texture=None):
+def material(name: str, kind: str, color: list[float], alpha: float, ior: float, texture: Path | None) -> Any:
     """A Cycles material of one node; ``alpha`` is the width of the GGX lobe."""
     made = bpy.data.materials.new(name)
     made.use_nodes = True
@@ -46,14 +47,14 @@ def material(name, kind, color, alpha, ior, texture=None):
     return made
 
 
-def load_image(path):
+def load_image(path: Path) -> Any:
     """A picture whose numbers are taken as they are."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     return image
 
 
-def mesh_object(name, arrays, made):
+def mesh_object(name: str, arrays: dict[str, Any], made: Any) -> Any:
     """A mesh in Blender's frame, linked into the scene."""
     vertices = arrays["vertices"] @ BLENDER_FROM_WORLD.T
     mesh = bpy.data.meshes.new(name)
@@ -71,7 +72,7 @@ def mesh_object(name, arrays, made):
     return made_object
 
 
-def build(job, folder):
+def build(job: dict[str, Any], folder: Path) -> Any:
     """The scene of a job: meshes, map, camera."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -108,7 +109,7 @@ def build(job, folder):
     return scene
 
 
-def configure(scene, job, want):
+def configure(scene: Any, job: dict[str, Any], want: dict[str, Any]) -> None:
     """Settings of one render: no clamp, box filter, no adaptive sampling, so that its mean is the truth."""
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
@@ -137,7 +138,7 @@ def configure(scene, job, want):
     settings.use_exr_interleave = True  # one part, not one part per pass
 
 
-def main(path):
+def main(path: str) -> None:
     """Every render of the job."""
     folder = Path(path).parent
     job = json.loads(Path(path).read_text())

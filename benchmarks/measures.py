@@ -6,9 +6,9 @@ independent ones, A and B, give the error without that noise and without having 
 
     E (X - A)(X - B) = E (X - truth)^2      A, B unbiased, independent of X and of each other
 
-A picture without bias costs CPU seconds inversely to its error, so ``error * cpu`` says what a strategy is worth and
-the ratio of two such products is a speed-up. A biased picture (a region left out, a denoiser) has no such constant: it
-is compared at its own error with what the unbiased strategy would have needed to reach that.
+A speed-up is a ratio of CPU seconds at equal error: a picture's own seconds, against those at which the other strategy,
+without bias, reaches the same error. Its curve is measured, and continued as one over time. That holds for biased
+pictures (a region left out, a denoiser) too, at the error where they were measured; there the bias counts as error.
 """
 
 from __future__ import annotations
@@ -65,16 +65,35 @@ def squared_error(shown: np.ndarray, first: np.ndarray, second: np.ndarray) -> f
     return float(np.mean((shown - first) * (shown - second)))
 
 
-def speedup(cheap: list[tuple[float, float]], dear: list[tuple[float, float]]) -> float:
-    """Cost of ``dear`` over that of ``cheap`` at equal error, both unbiased: medians of (error, CPU s) products."""
-    return product(dear) / product(cheap)
+@dataclass(frozen=True)
+class Point:
+    """One picture: its squared error in code values, what it cost, and the samples per pixel asked for."""
+
+    error: float
+    cpu_s: float
+    samples: int = 0
 
 
-def product(runs: list[tuple[float, float]]) -> float:
-    """Median over runs of error times CPU seconds."""
-    return float(np.median([error * seconds for error, seconds in runs]))
+def middle(points: list[Point]) -> Point:
+    """The median of replicates, error and cost apart."""
+    error, seconds = (float(np.median([getattr(p, name) for p in points])) for name in ("error", "cpu_s"))
+    return Point(error, seconds, points[0].samples)
 
 
-def speedup_at(error: float, seconds: float, dear: list[tuple[float, float]]) -> float:
-    """CPU seconds of an unbiased strategy at ``error``, from its runs (error, CPU s), over ``seconds``."""
-    return product(dear) / error / seconds
+def cost_at(error: float, curve: list[Point]) -> float:
+    """CPU seconds at which a curve of a strategy without bias reaches ``error``.
+
+    Log-log interpolation between its points; beyond them the error of an unbiased mean falls as one over time.
+    """
+    points = sorted(curve, key=lambda p: p.cpu_s)
+    if error >= points[0].error:
+        return points[0].cpu_s * points[0].error / error
+    if error <= points[-1].error:
+        return points[-1].cpu_s * points[-1].error / error
+    errors, seconds = (np.log([getattr(p, name) for p in reversed(points)]) for name in ("error", "cpu_s"))
+    return float(np.exp(np.interp(np.log(error), errors, seconds)))
+
+
+def speedup(point: Point, curve: list[Point]) -> float:
+    """How many times the CPU seconds of ``point`` the strategy of ``curve`` needs for the same error."""
+    return cost_at(point.error, curve) / point.cpu_s

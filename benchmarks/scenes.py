@@ -23,17 +23,24 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
+class Shape:
+    """Triangles with smooth or flat normals, world frame."""
+
+    vertices: np.ndarray  # (N, 3) m
+    normals: np.ndarray  # (N, 3) unit
+    faces: np.ndarray  # (M, 3) counter-clockwise seen from outside
+
+
+@dataclass(frozen=True, eq=False)
 class Item:
-    """One object: triangles in the world frame and what they are made of.
+    """One object and what it is made of.
 
     ``kind``: diffuse (Lambert), glossy (GGX of width ``alpha``, white Fresnel), glass (smooth, ``ior``) or mirror.
     """
 
     name: str
     kind: str
-    vertices: np.ndarray  # (N, 3) m
-    normals: np.ndarray  # (N, 3) unit
-    faces: np.ndarray  # (M, 3)
+    shape: Shape
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     alpha: float = 0.0
     ior: float = 1.0
@@ -141,7 +148,7 @@ def pinhole(width: int, height: int, fov_deg: float = 50.0) -> Camera:
     return Camera(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
 
 
-def ball(radius: float, centre: tuple[float, float, float], steps: int = 96) -> dict[str, np.ndarray]:
+def ball(radius: float, centre: tuple[float, float, float], steps: int = 96) -> Shape:
     """A sphere as a grid of longitudes and latitudes with exact normals; its poles are fans of thin triangles."""
     theta = np.linspace(0, np.pi, steps + 1)[1:-1]
     phi = 2 * np.pi * np.arange(2 * steps) / (2 * steps)
@@ -163,12 +170,14 @@ def ball(radius: float, centre: tuple[float, float, float], steps: int = 96) -> 
     a, b, c, e = (corner.ravel() for corner in corners)
     bottom = np.stack([0 * here + last, 1 + count * (steps - 2) + here, 1 + count * (steps - 2) + beside], -1)
     faces = np.concatenate([top, np.stack([a, b, c], -1), np.stack([b, e, c], -1), bottom])
-    return {"vertices": radius * normals + centre, "normals": normals, "faces": faces}
+    return Shape(radius * normals + centre, normals, faces)
 
 
-def box(size: tuple[float, float, float], centre: tuple[float, float, float], yaw_deg: float) -> dict[str, np.ndarray]:
+def box(size: tuple[float, float, float], centre: tuple[float, float, float], yaw_deg: float) -> Shape:
     """A box with flat faces: four vertices of its own for each."""
-    vertices, normals, faces = [], [], []
+    vertices: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
     for axis in range(3):
         for sign in (-1, 1):
             normal, along = np.zeros(3), np.zeros(3)
@@ -181,7 +190,7 @@ def box(size: tuple[float, float, float], centre: tuple[float, float, float], ya
     return turned(np.array(vertices) * np.divide(size, 2), np.array(normals), np.array(faces), centre, yaw_deg)
 
 
-def column(radius: float, height: float, centre: tuple[float, float, float], steps: int = 96) -> dict[str, np.ndarray]:
+def column(radius: float, height: float, centre: tuple[float, float, float], steps: int = 96) -> Shape:
     """An upright cylinder that stands on ``centre``, closed above and below."""
     phi = 2 * np.pi * np.arange(steps) / steps
     side = np.stack([np.cos(phi), 0 * phi, np.sin(phi)], -1)
@@ -203,19 +212,19 @@ def column(radius: float, height: float, centre: tuple[float, float, float], ste
 
 def turned(
     vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, centre: tuple[float, float, float], yaw_deg: float
-) -> dict[str, np.ndarray]:
+) -> Shape:
     """A mesh turned about +Y and moved."""
     c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    return {"vertices": vertices @ rotation.T + centre, "normals": normals @ rotation.T, "faces": faces}
+    return Shape(vertices @ rotation.T + centre, normals @ rotation.T, faces)
 
 
 def plain_items() -> list[Item]:
     """A diffuse ball, a glossy ball, a diffuse box."""
     return [
-        Item("clay", "diffuse", **ball(0.2, (-0.55, 0.2, 0.05)), color=(0.55, 0.2, 0.12)),
-        Item("steel", "glossy", **ball(0.2, (0.0, 0.2, -0.15)), alpha=0.2),
-        Item("crate", "diffuse", **box((0.32, 0.3, 0.32), (0.55, 0.15, 0.0), 25), color=(0.2, 0.35, 0.5)),
+        Item("clay", "diffuse", ball(0.2, (-0.55, 0.2, 0.05)), color=(0.55, 0.2, 0.12)),
+        Item("steel", "glossy", ball(0.2, (0.0, 0.2, -0.15)), alpha=0.2),
+        Item("crate", "diffuse", box((0.32, 0.3, 0.32), (0.55, 0.15, 0.0), 25), color=(0.2, 0.35, 0.5)),
     ]
 
 
@@ -231,8 +240,8 @@ def diffuse_glossy(width: int = 1280, height: int = 720) -> Scene:
 def glass_mirror(width: int = 1280, height: int = 720) -> Scene:
     """The same with a glass and a mirror ball: caustics of the sun."""
     base = diffuse_glossy(width, height)
-    glass = Item("glass", "glass", **ball(0.15, (-0.2, 0.15, 0.45)), ior=1.5)
-    mirror = Item("mirror", "mirror", **ball(0.15, (0.3, 0.15, 0.5)))
+    glass = Item("glass", "glass", ball(0.15, (-0.2, 0.15, 0.45)), ior=1.5)
+    mirror = Item("mirror", "mirror", ball(0.15, (0.3, 0.15, 0.5)))
     return replace(base, name="glass_mirror", items=[*base.items, glass, mirror])
 
 
@@ -240,7 +249,7 @@ def hard_sun(width: int = 1280, height: int = 720) -> Scene:
     """A clear sky, a low sun of two texels (its true size), one tall column: a long umbra with a hard edge."""
     environment, sun = sky_with_sun(22, 285, 0.7, (1, 2), clear=True)
     pose = looking((0, 1.8, 2.6), (0, 0, 0.03))
-    items = [Item("column", "diffuse", **column(0.06, 0.7, (-0.85, 0.0, 0.1)), color=(0.5, 0.45, 0.4))]
+    items = [Item("column", "diffuse", column(0.06, 0.7, (-0.85, 0.0, 0.1)), color=(0.5, 0.45, 0.4))]
     return Scene("hard_sun", environment, sun, textured_albedo(), floor(), pinhole(width, height), pose, items)
 
 

@@ -1,0 +1,194 @@
+"""How fast the render is at equal error: ``make bench-render`` writes docs/benchmarks/render.json and render.md.
+
+    python -m benchmarks.render [--full] [--size 1280x720] [--scenes diffuse_glossy,...] [--out docs/benchmarks]
+
+Replicates of the strategies take turns, so that whatever else the machine does burdens all alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import cycles
+from benchmarks.estimators import Loaded, insitu, load, naive, ours, plate_of, reference
+from benchmarks.measures import Point, cpu_seconds, display, exposure_gain, middle, speedup, squared_error
+from benchmarks.page import write_page
+from benchmarks.plates import tiny_ratio
+from benchmarks.scenes import SCENES, Scene, facts
+from stages.knobs import Render
+
+NAIVE_DEPTH = 8
+LATTICE = 3  # every third pixel in both directions: an error needs no more, a reference costs a ninth
+TILE = 8  # chosen pixels, of the comparison of means
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much to measure."""
+
+    replicates: int = 3
+    naive: tuple[int, ...] = (4, 16, 64)  # samples per pixel; the last is replicated
+    ours: tuple[int, ...] = (4, 16)
+    reference: tuple[int, int] = (16, 128)  # samples per pixel; the second where there is noise
+    plate: int = 16
+    cycles: int = 8
+
+
+FULL = Budget(5, (4, 16, 64, 256), (4, 16, 64), (64, 1024), 64, 64)
+
+
+def measure(scene: Scene, budget: Budget, threads: int, say: Any) -> dict[str, Any]:
+    """Curves and speed-ups of one scene."""
+    stage = load(scene)
+    plate = plate_of(stage, NAIVE_DEPTH, budget.plate)
+    gain = exposure_gain(plate)
+    width, height = scene.camera.width, scene.camera.height
+    chosen = lattice(width, height)
+    part, share = stage.at(chosen), len(stage.rays) / len(chosen)
+    warm(part, plate[chosen], budget)
+    with cpu_seconds() as spent:
+        truths = [display(reference(part, plate[chosen], budget.reference, 1000 + half), gain) for half in range(2)]
+    say(f"{scene.name}: two references, {spent.seconds:.0f} CPU s")
+    groups: dict[tuple[str, int], list[Point]] = {}
+
+    def add(name: str, picture: np.ndarray, seconds: float, samples: int) -> None:
+        point = Point(squared_error(display(picture, gain), *truths), seconds, samples)
+        groups.setdefault((name, samples), []).append(point)
+        say(f"{scene.name}: {name} {samples} spp, squared error {point.error:.3f}, {seconds:.2f} CPU s")
+
+    for turn in range(budget.replicates):
+        for name, strategy, ladder in (("naive", naive, budget.naive), ("difference", ours, budget.ours)):
+            for samples in ladder if turn == 0 else ladder[-1:]:
+                with cpu_seconds() as spent:
+                    picture = strategy(part, plate[chosen], samples, NAIVE_DEPTH, 101 * turn)
+                add(name, picture, spent.seconds * share, samples)
+        for made in insitu(stage, plate, Render(), 101 * turn, every=turn == 0):
+            add("insitu" if made.denoised else "region", made.picture[chosen], made.cpu_s, made.samples)
+    curves: dict[str, list[Point]] = {}
+    for (name, _), points in sorted(groups.items()):
+        curves.setdefault(name, []).append(middle(points))
+    peer = None
+    if cycles.available():
+        peer, apart = cycles_facts(stage, plate, gain, chosen, truths, budget, threads)
+        say(f"{scene.name}: Cycles {apart}, {peer}")
+        curves |= apart
+    result: dict[str, Any] = {
+        f"speedup_over_{other}{ending}": speedup(curves[own][-1], curves[other]) if other in curves else None
+        for other in ("naive", "cycles")
+        for own, ending in (("difference", ""), ("region", "_region"), ("insitu", "_denoised"))
+    }
+    return result | {
+        "curves": {name: [asdict(point) for point in points] for name, points in curves.items()},
+        "cycles": peer,
+        "map": facts(scene),
+        "reference_noise": float(np.mean((truths[0] - truths[1]) ** 2) / 2),
+    }
+
+
+def lattice(width: int, height: int) -> np.ndarray:
+    """Flat indices of every third pixel in both directions: those whose error is taken."""
+    return (np.arange(LATTICE // 2, height, LATTICE)[:, None] * width + np.arange(LATTICE // 2, width, LATTICE)).ravel()
+
+
+def warm(part: Loaded, plate: np.ndarray, budget: Budget) -> None:
+    """Compile the kernels on few pixels: compiling is not rendering."""
+    few = part.at(np.arange(0, len(part.rays), 64))
+    for samples in {*budget.naive, *budget.ours}:
+        for strategy in (naive, ours):
+            strategy(few, plate[::64], samples, NAIVE_DEPTH, 1)
+
+
+def cycles_facts(
+    stage: Loaded,
+    plate: np.ndarray,
+    gain: float,
+    chosen: np.ndarray,
+    truths: list[np.ndarray],
+    budget: Budget,
+    threads: int,
+) -> tuple[dict[str, Any], dict[str, list[Point]]]:
+    """What Cycles costs per frame and how far its mean is from the reference's; its curves by marginal cost.
+
+    Its noise comes from the difference of replicates, so that what sets its mean apart from ours costs it nothing.
+    """
+    noisy = [cycles.Wanted(budget.cycles, 11 + i) for i in range(budget.replicates)]
+    wanted = [cycles.Wanted(1, 1), *noisy, cycles.Wanted(budget.cycles, 99, denoise=True)]
+    with tempfile.TemporaryDirectory() as folder:
+        renders, version = cycles.render(stage.scene, wanted, Path(folder), threads)
+    single, *same, quiet = renders
+    per_sample = (np.median([r.cpu_s for r in same]) - single.cpu_s) / (budget.cycles - 1)
+    fixed = float(single.cpu_s - per_sample)
+    shown = [display(r.composite(plate), gain)[chosen] for r in same]
+    noise = [np.mean((a - b) ** 2) / 2 for i, a in enumerate(shown) for b in shown[:i]]
+    error = squared_error(display(quiet.composite(plate), gain)[chosen], *truths)
+    columns = len(range(LATTICE // 2, stage.scene.camera.width, LATTICE))
+    apart = (np.mean(shown, 0) - np.mean(truths, 0)).reshape(-1, columns, 3)
+    rows = len(apart) // TILE * TILE
+    tiles = apart[:rows, : columns // TILE * TILE].reshape(rows // TILE, TILE, -1, TILE, 3).mean((1, 3))
+    return {
+        "version": version,
+        "fixed_cpu_s": fixed,
+        "mean": [float(v) for v in np.mean(shown, (0, 1))],
+        "reference_mean": [float(v) for v in np.mean(truths, (0, 1))],
+        "tiles_median": float(np.median(np.abs(tiles))),
+        "tiles_p99": float(np.quantile(np.abs(tiles), 0.99)),
+    }, {
+        "cycles": [Point(float(np.median(noise)), float(per_sample * budget.cycles), budget.cycles)],
+        "cycles_oidn": [Point(error, quiet.cpu_s - fixed, budget.cycles)],
+    }
+
+
+def zscore() -> float | None:
+    """Largest z of tile means of the difference against the oracle; None while that benchmark is not there."""
+    if importlib.util.find_spec("benchmarks.zscore") is None:
+        return None
+    return float(importlib.import_module("benchmarks.zscore").run()["zscore_max"])
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--full", action="store_true", help="more samples and replicates (an hour)")
+    parser.add_argument("--size", default="1280x720", help="of the pictures [px]")
+    parser.add_argument("--scenes", default=",".join(SCENES), help="which, with commas")
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder")
+    given = parser.parse_args()
+    width, height = (int(v) for v in given.size.split("x"))
+    budget = FULL if given.full else Budget()
+    threads = len(os.sched_getaffinity(0))
+    started = time.time()
+
+    def say(text: str) -> None:
+        print(f"{time.time() - started:5.0f} s  {text}", file=sys.stderr, flush=True)  # noqa: T201  a command's progress
+
+    if not cycles.available():
+        say("Cycles is left out: no .blender environment; `make bench-cycles-env` makes it")
+    record: dict[str, Any] = {
+        name: measure(SCENES[name](width, height), budget, threads, say) for name in given.scenes.split(",")
+    }
+    record["tiny_24mpx_over_1mpx"], record["tiny"] = tiny_ratio(budget.replicates)
+    say(f"24 over 1 Mpx: {record['tiny_24mpx_over_1mpx']:.2f}")
+    if "diffuse_glossy" in record:
+        first = record["diffuse_glossy"]["curves"]["insitu"][0]
+        record["preview_cpu_s"], record["preview_rmse_255"] = first["cpu_s"], max(first["error"], 0.0) ** 0.5
+    record["zscore_max"] = zscore()
+    record["size"], record["threads"], record["wall_s"] = [width, height], threads, time.time() - started
+    given.out.mkdir(parents=True, exist_ok=True)
+    (given.out / "render.json").write_text(json.dumps(record, indent=1) + "\n")
+    write_page(record, given.out)
+    say(f"wrote {given.out / 'render.md'}")
+
+
+if __name__ == "__main__":
+    main()
