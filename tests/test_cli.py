@@ -10,6 +10,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,6 +104,9 @@ def test_every_problem_of_the_texts_at_once(wrong, capsys):
         (("--upto", "rendr"), "--upto: is 'rendr'; expected one of ingest"),
         (("--set", "composite.view=Filmic"), "composite.view: is 'Filmic'; 'sRGB - Display'"),
         (("--set", "composite.display=CRT"), "composite.display: is 'CRT'"),
+        (("--view", "Filmic"), "composite.view: is 'Filmic'; 'sRGB - Display'"),
+        (("--display", "CRT"), "composite.display: is 'CRT'"),
+        (("--look", "Grade"), "'ACES 1.3 Reference Gamut Compression'"),
         (("--scene", "nowhere.toml"), "nowhere.toml: no such file"),
     ],
 )
@@ -116,6 +120,63 @@ def test_wrong_switch_is_one_line_before_anything_runs(switch, says, capsys, tmp
 def test_ocio_config_that_cannot_be_read(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("OCIO", str(tmp_path / "none.ocio"))
     assert "OCIO" in refused(capsys, 2, "run", DESK, "--out", tmp_path / "out")[0]
+
+
+# A config of one display, two views and one look.
+OCIO = """ocio_profile_version: 2
+roles: {aces_interchange: aces, scene_linear: aces, default: aces}
+displays: {Wall: [!<View> {name: Plain, colorspace: aces}, !<View> {name: Half, colorspace: half}]}
+looks: [!<Look> {name: twice, process_space: aces, transform: !<CDLTransform> {slope: [2, 2, 2]}}]
+colorspaces:
+  - !<ColorSpace> {name: aces, encoding: scene-linear}
+  - !<ColorSpace> {name: half, from_scene_reference: !<CDLTransform> {slope: [0.5, 0.5, 0.5]}}
+"""
+
+
+@pytest.fixture
+def own_ocio(tmp_path, monkeypatch) -> Path:
+    path = tmp_path / "own.ocio"
+    path.write_text(OCIO)
+    monkeypatch.setenv("OCIO", str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("switches", "says"),
+    [
+        ((), "composite.display: is 'sRGB - Display'; {} has ['Wall']"),
+        (("--display", "Wall"), "'Wall' of {} has ['Plain', 'Half']"),
+        (("--display", "Wall", "--view", "Half", "--look", "thrice"), "composite.look: is 'thrice'; {} has ['twice']"),
+    ],
+)
+def test_choices_are_those_of_the_config_in_force(switches, says, own_ocio, capsys, tmp_path):
+    (line,) = refused(capsys, 2, "settings", DESK, "--out", tmp_path / "out", *switches)
+    assert says.format(own_ocio) in line
+    assert not (tmp_path / "out").exists()
+
+
+def composite_knobs(out: Path) -> dict[str, object]:
+    return json.loads((out / "settings.json").read_text())["params"]["composite"]
+
+
+def test_switches_for_looking_are_settings(own_ocio, tmp_path):
+    """They win over --set, and a stage takes them too; what is not given stays as it was asked last."""
+    out = tmp_path / "out"
+    switches = ["--display", "Wall", "--view", "Half", "--set", "composite.view=Plain", "--set", "composite.kind=ratio"]
+    assert main(["settings", str(DESK), "--out", str(out), *switches]) == 0
+    found = composite_knobs(out)
+    assert (found["display"], found["view"], found["look"], found["kind"]) == ("Wall", "Half", "", "ratio")
+
+
+def test_composite_takes_the_switches_for_looking(desk_build, tmp_path):
+    """The picture changes, the linear result does not; the settings say so, for make and for the next command."""
+    out = copied(desk_build, tmp_path / "out")
+    shutil.copy(desk_build / "settings.json", out)
+    assert main(["composite", str(DESK), "--out", str(out), "--view", "Un-tone-mapped"]) == 0
+    before, found = composite_knobs(desk_build), composite_knobs(out)
+    assert found == before | {"view": "Un-tone-mapped"}
+    for name, same in (("display.png", False), ("composite.exr", True)):
+        assert ((out / "composite" / name).read_bytes() == (desk_build / "composite" / name).read_bytes()) == same
 
 
 @pytest.mark.parametrize("text", ["name = ", "\xff\xfe", ""])

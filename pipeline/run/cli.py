@@ -188,14 +188,12 @@ def looked_at(chosen: Settings, args: argparse.Namespace) -> Settings:
     known = KNOBS["composite"]().model_dump()
     given = {knob: value for knob in LOOKING if (value := getattr(args, knob, None)) is not None}
     wanted = known | chosen.params["composite"] | given
-    if os.environ.get("OCIO") or any(wanted[knob] != known[knob] for knob in LOOKING if knob in known):
+    if os.environ.get("OCIO") or any(wanted[knob] != known[knob] for knob in LOOKING):
         import numpy as np
 
         from pipeline.image.display import display_transform
 
-        display_transform(
-            np.zeros((1, 1, 3)), **{knob: wanted[knob] for knob in LOOKING if knob in wanted}
-        )  # now, not after rendering
+        display_transform(np.zeros((1, 1, 3)), **{knob: wanted[knob] for knob in LOOKING})  # now, not after rendering
     return chosen.model_copy(update={"params": {**chosen.params, "composite": wanted}}) if given else chosen
 
 
