@@ -74,7 +74,7 @@ def compose(
     if half:
         built = built.with_half_mul()
     picture = built.apply(rgb)
-    built = d.flagged(built, d.NEGATIVE, np.asarray((picture < 0) & (rgb >= 0)).any(-1))
+    built = d.flagged(built, d.NEGATIVE, ((picture < 0) & (rgb >= 0)).max(-1))
     clipped = built.touched & (built.alpha < 1) & ((plate["mask"] & CLIPPED) > 0)
     return picture, d.flagged(built, d.CLIPPED_PLATE, np.asarray(clipped))
 

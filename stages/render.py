@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.camera.lens import ray_grid
 from pipeline.conventions import ACESCG
-from pipeline.image.colour import Space
+from pipeline.image.colour import Space, luminance
 from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
@@ -29,7 +29,7 @@ from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.region import limits_for
 from pipeline.transport.scene import Worlds, build_worlds
-from pipeline.transport.surfaces import material_bsdf, mesh_shape
+from pipeline.transport.surfaces import object_shape
 from pipeline.transport.trace import Rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
@@ -50,8 +50,8 @@ def world_from_object(wish: dict[str, Any], plane: Plane) -> np.ndarray:
     return matrix
 
 
-def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any], list[str]]:
-    """Mitsuba shapes of every wished object, and warnings."""
+def place_objects(wishes: dict[str, Any], plane: Plane, white: float) -> tuple[dict[str, Any], list[str]]:
+    """Mitsuba shapes of every wished object, and warnings; ``white``: radiance that an emission of 1 stands for."""
     mi = use_mitsuba()
     shapes, warnings = {}, []
     for wish in wishes["object"]:
@@ -65,8 +65,9 @@ def place_objects(wishes: dict[str, Any], plane: Plane) -> tuple[dict[str, Any],
                 space = given.pop("space")
                 material = Material(**given)
             name = f"{wish['name']}_{index}"
-            bsdf = material_bsdf(mi, material, space)
-            shapes[name] = mesh_shape(mi, name, mesh, world_from_object(wish, plane), bsdf)
+            placed = world_from_object(wish, plane)
+            shapes[name], notes = object_shape(mi, name, mesh, placed, material, space, white)
+            warnings += notes
     return shapes, warnings
 
 
@@ -103,7 +104,8 @@ def compute(
             {"influenced_fraction": 0.0},
             ["scene.toml: no objects; the plate comes back"],
         )
-    shapes, warnings = place_objects(wishes, plane)
+    diffuse_white = float(luminance(irradiance(environment.rgb(), plane.normal[None])[0])) / np.pi
+    shapes, warnings = place_objects(wishes, plane, diffuse_white)
     xn, dxn = ray_grid(camera)
     rays = Rays.of(views["plate"].world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
     plate = photographs["plate"]
@@ -114,11 +116,11 @@ def compute(
         params.strategy, params.samples, params.depth, params.denoise, params.seed, adaptive=not params.light_groups
     )
 
-    def worlds_under(light: np.ndarray, lamps: list[Emitter]) -> tuple[Worlds, np.ndarray]:
-        worlds = build_worlds(plane, albedo.rgb(), light, shapes, local_proxies, lamps, surface, occluders)
+    def worlds_under(light: np.ndarray, lamps: list[Emitter], objects: dict[str, Any]) -> tuple[Worlds, np.ndarray]:
+        worlds = build_worlds(plane, albedo.rgb(), light, objects, local_proxies, lamps, surface, occluders)
         return worlds, irradiance(light, plane.normal[None])[0]
 
-    worlds, light = worlds_under(environment.rgb(), emitters)
+    worlds, light = worlds_under(environment.rgb(), emitters, shapes)
     canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, tell)
     if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
@@ -129,7 +131,12 @@ def compute(
         "variant": use_mitsuba().variant(),
     }
     if params.light_groups:
-        parts = {name: worlds_under(*part) for name, part in groups(environment.rgb(), emitters).items()}
+        # What the objects themselves send out is light of one group only, the sky's.
+        objects = {"sky": shapes, "lamp": place_objects(wishes, plane, 0.0)[0]}
+        parts = {
+            name: worlds_under(*part, objects["sky" if name == "sky" else "lamp"])
+            for name, part in groups(environment.rgb(), emitters).items()
+        }
         result = by_group({name: lit(canvas, *part) for name, part in parts.items()})
     else:
         result = refined(canvas)

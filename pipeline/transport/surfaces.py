@@ -84,7 +84,7 @@ def area_emitter(mi: Any, material: Material, space: Space, white: float) -> dic
     ``white`` is the radiance that an emission of 1 stands for: that of a white surface lying on the plane,
     luminance of the irradiance / pi. A scalar, so that the emission keeps its own colour under any light.
     """
-    if not any(material.emission):
+    if not any(material.emission) or white == 0:
         return None
     color = np.asarray(material.emission, float) * white
     if material.emission_texture is None:
