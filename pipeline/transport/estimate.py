@@ -161,7 +161,7 @@ def received(
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     image = light.reshape(*shape, 3)[tuple(nearest)]
     guide = traced.albedo.reshape(*shape, 3)[tuple(nearest)]
-    return denoise(image, guide).reshape(-1, 3) if effort.denoise else image.reshape(-1, 3)
+    return denoise(image, guide)[0].reshape(-1, 3) if effort.denoise else image.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
