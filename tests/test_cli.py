@@ -395,6 +395,12 @@ def test_verify_and_summary(desk_build, capsys):
     assert all(f"\n{name} " in text for name in NAMES)
 
 
+def test_run_says_which_renderer_was_chosen(desk_build):
+    assert re.search(
+        r"\nrender +ran +[\d.]+ s  (cuda_ad|llvm_ad|scalar)_rgb\n", (desk_build.parent / "stdout").read_text()
+    )
+
+
 def test_nothing_is_written_into_the_capture(desk_build):
     """After the whole run of the session's build."""
     assert desk_build.exists()
