@@ -238,6 +238,8 @@ def centre_albedo(worlds: Worlds, rays: Rays) -> np.ndarray:
     """(N, 3) albedo of the local scene where the middle of each pixel meets it, zero where it does not."""
     import drjit as dr
 
+    if not len(rays):
+        return np.zeros((0, 3))
     mi = worlds.mi
     centre = mi.Point2f(0.5) + dr.zeros(mi.Point2f, len(rays))
     _, hit, _, on_local = camera_hits(worlds, rays, 1, centre, 0.0)
