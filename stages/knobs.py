@@ -72,6 +72,9 @@ class Reflectance(Params):
     """Albedo of the local scene."""
 
     model: Literal["uniform", "textured"] = Field("textured", description="albedo model of the plane")
+    route: Literal["ratio", "gradient"] = Field(
+        "ratio", description="albedo by equation 8, or refined by differentiable rendering (slow)"
+    )
     texture_px: int = Field(1024, ge=16, le=8192, description="size of the albedo texture [px]")
 
 

@@ -5,7 +5,8 @@ does not show, or shows clipped, or that a proxy hides, continue their surroundi
 alone under distant light needs one step. With proxies their shadows are divided out and their bounced light is taken
 off, by the gathered form or the damped iteration (`pipeline.transport.radiosity`); their own albedo is measured too.
 Shadows of compact lights that nothing modelled casts are looked for and masked (`pipeline.transport.shadows`); gloss is
-taken up when held-out cells ask for it (`pipeline.transport.specular`). Limits: proxies are diffuse; a shadow that is
+taken up when held-out cells ask for it (`pipeline.transport.specular`). ``route = "gradient"`` refines the result by
+differentiable rendering. Limits: proxies are diffuse; a shadow that is
 not found stays in the albedo, and the ratio composite undoes it again.
 """
 
@@ -20,9 +21,11 @@ from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run.errors import NumericalError
 from pipeline.run.stage import Stage
-from pipeline.transport.plate_texture import read_plate, shrunk, texture_size, window_points
+from pipeline.transport.gradient import Fit, fit
+from pipeline.transport.patches import enlarged
+from pipeline.transport.plate_texture import continued, read_plate, shrunk, texture_size, window_points
 from pipeline.transport.radiosity import Estimate
-from pipeline.transport.reflectance import fill_unseen, updated_brdf
+from pipeline.transport.reflectance import updated_brdf
 from pipeline.transport.scale import disagreement, unsure_share, warning
 from pipeline.transport.shadows import Found, darkening, unexplained
 from pipeline.transport.specular import base_of, cells_of, climb, explain
@@ -80,14 +83,23 @@ def compute(
         if surface.model != "diffuse":
             measured = base_of(surface, values, environment.rgb(), plane.normal, points, eye)
             known &= np.isfinite(measured).all(-1)
+    fitted = None
+    if params.route == "gradient" and surface.model == "diffuse":
+        fitted = fit(
+            plane, continued(measured, known * seen, texture.window, shape), local_proxies, occluders,
+            environment.rgb(), plate, camera, view,
+        )  # fmt: skip
+        measured = measured * enlarged(fitted.factor, *shape)[texture.window]
+        pairs = zip(local_proxies, fitted.proxies)
+        local_proxies = [proxy.model_copy(update={"albedo": albedo}) for proxy, albedo in pairs]
     ratios = darkening(emitters, plane.normal, alone)
     shadow = unexplained(measured, known, ratios)
     if shadow.lights:
         known &= ~shadow.mask
         seen = np.where(shadow.mask, 0.0, seen)
         warnings.append(
-            f"plate: {shadow.fraction:.1%} of the seen plane lies in a shadow of {', '.join(shadow.lights)} that nothing "
-            "modelled casts; the albedo there continues its surroundings. Describe what casts it as a [[proxy]]"
+            f"plate: {shadow.fraction:.1%} of the seen plane lies in a shadow of {', '.join(shadow.lights)} that "
+            "nothing modelled casts; the albedo there continues its surroundings. Describe what casts it as a [[proxy]]"
         )
     sigma = np.pi * updated_brdf(np.sqrt(kept * texture.variance), light)
     variance = environment.rgb("variance") if "variance.R" in environment.channels else None
@@ -95,13 +107,10 @@ def compute(
     scale = disagreement(measured[known], sigma[known], unsure)
     if said := warning(scale, np.quantile(measured[known], 0.01, axis=0)):
         warnings.append(said)
-    albedo, weight = np.zeros((*shape, 3)), np.zeros(shape)
-    albedo[texture.window] = np.where(known[..., None], measured, 0.0)
-    weight[texture.window] = known * seen
     if params.model == "uniform":
-        albedo = np.broadcast_to(np.median(measured[known], axis=0), albedo.shape)
+        albedo = np.broadcast_to(np.median(measured[known], axis=0), (*shape, 3))
     else:
-        albedo = fill_unseen(albedo, np.minimum(weight, 1.0))
+        albedo = continued(measured, known * seen, texture.window, shape)
     share = np.zeros(shape)
     share[texture.window] = seen
     numbers = {
@@ -122,6 +131,7 @@ def compute(
     terms = [
         texture_evidence(params.model, numbers["detail_kept"]),
         bounce_evidence(near.estimate if near else None),
+        *([gradient_evidence(fitted)] if fitted else []),
         shadow_evidence(list(ratios), shadow),
         explain(surface),
     ]
@@ -154,6 +164,18 @@ def shadow_evidence(asked: list[str], found: Found) -> dict[str, Any]:
         "modelled": bool(found.lights),
         "because": because,
         "could_cost": "soft shadows and shadows on fine texture are taken for albedo, which the ratio composite undoes",
+    }
+
+
+def gradient_evidence(found: Fit) -> dict[str, Any]:
+    """What differentiable rendering changed."""
+    change = np.abs(found.factor - 1)
+    return {
+        "term": "refinement by differentiable rendering",
+        "modelled": True,
+        "because": f"knob reflectance.route = gradient; squared relative error {found.loss[0]:.4g} at first, "
+        f"{np.mean(found.loss[-8:]):.4g} at last; albedo changed by {change.mean():.1%}, at most {change.max():.1%}",
+        "could_cost": "the path tracer's noise, less than what the loss left",
     }
 
 

@@ -38,6 +38,7 @@ BRIDGES = {
     "mitsuba": {"pipeline/transport/variant.py"},
     "drjit": {
         "pipeline/transport/difference.py",
+        "pipeline/transport/gradient.py",
         "pipeline/transport/materials.py",
         "pipeline/transport/trace.py",
         "pipeline/simulation/photograph.py",

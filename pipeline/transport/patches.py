@@ -315,8 +315,8 @@ def shadow_edges(
     """What the edges of strong lights' shadows add to an irradiance that was interpolated between cells.
 
     ``cells`` (rows, columns, 3) are the centres of the cells, ``points`` (h, w, 3) the texels of a window of a texture
-    of ``shape`` over the same rectangle, ``wanted`` (h, w) those that matter, ``light`` (3,) the plane's irradiance with
-    nothing in the way. Returns (h, w, 3): irradiance of the strong lights at each texel less the same interpolated.
+    of ``shape`` over the same rectangle, ``wanted`` (h, w) those that matter, ``light`` (3,) the plane's irradiance
+    with nothing in the way. Returns (h, w, 3): irradiance of the strong lights at each texel less the interpolated one.
     Only cells where a light is partly hidden, and their neighbours, are traced.
     """
     from scipy.ndimage import maximum_filter, minimum_filter

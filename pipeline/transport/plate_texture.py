@@ -16,6 +16,7 @@ from pipeline.camera.lens import project
 from pipeline.conventions import CLIPPED, invert_rigid, transform_points
 from pipeline.image.metrics import box
 from pipeline.light.sampling import bilinear, planes
+from pipeline.transport.reflectance import fill_unseen
 from pipeline.types import Camera, Plane, Raster, View
 
 MAX_SUPERSAMPLE = 2
@@ -146,3 +147,13 @@ def shrunk(texture: Texture) -> tuple[np.ndarray, np.ndarray]:
     spread = np.maximum(box(seen * texture.radiance**2, size) / count - mean**2 - noise, 0.0)
     kept = np.divide(spread, spread + texture.variance, out=np.ones_like(spread), where=texture.variance > 0)
     return mean + kept * away, kept
+
+
+def continued(
+    values: np.ndarray, weight: np.ndarray, window: tuple[slice, slice], shape: tuple[int, int]
+) -> np.ndarray:
+    """The texture (H, W, 3) of ``shape`` with ``values`` (h, w, 3) in its window, continued where ``weight`` is 0."""
+    whole, share = np.zeros((*shape, values.shape[-1])), np.zeros(shape)
+    whole[window] = np.where(weight[..., None] > 0, values, 0.0)
+    share[window] = np.minimum(weight, 1.0)
+    return fill_unseen(whole, share)

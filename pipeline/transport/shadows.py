@@ -59,9 +59,7 @@ def unexplained(albedo: np.ndarray, known: np.ndarray, ratios: dict[str, np.ndar
     weight = known[part].reshape(height, size, width, size).mean((1, 3))
     sums = (albedo[part] * known[part][..., None]).reshape(height, size, width, size, 3).mean((1, 3))
     fine = (weight > 0.5) & (sums.min(-1) > 0)
-    picture = np.where(
-        fine[..., None], np.log(np.where(fine[..., None], sums, 1.0) / np.maximum(weight, 1e-9)[..., None]), 0
-    )
+    picture = np.log(np.where(fine[..., None], sums, 1.0) / np.where(fine, weight, 1.0)[..., None])
     blurred = gaussian_filter(fine.astype(float), 1.0)
     picture = gaussian_filter(picture, (1.0, 1.0, 0.0)) / np.maximum(blurred, 1e-9)[..., None]
     mask, lights = np.zeros((height, width), bool), []
