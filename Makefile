@@ -10,6 +10,7 @@ CAPTURE ?= sample_captures/desk
 SCENE ?=
 export INSITU_DATA ?= $(abspath ../shared/data)
 QUALITY ?=
+BENCH ?=
 OUT ?= build/$(notdir $(CAPTURE:/=))
 PYTHON ?= python3
 VENV := .venv
@@ -69,6 +70,13 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
+bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
+	@$(VENV)/bin/python -m benchmarks.render $(BENCH)
+
+bench-cycles-env:  ## Blender's Cycles for bench-render, in .blender (Python 3.11, 1 GB)
+	@test -x .blender/bin/python || python3.11 -m venv --without-pip .blender
+	python3 -m pip --python .blender/bin/python install --quiet 'bpy==5.0.1' 'numpy<2'
+
 verify: $(READY)  ## recompute the digests of a build
 	@$(INSITU) verify $(CAPTURE) --out $(OUT)
 
@@ -80,4 +88,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-render bench-cycles-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE

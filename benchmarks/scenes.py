@@ -255,7 +255,7 @@ def hard_sun(width: int = 1280, height: int = 720) -> Scene:
 
 def corner(width: int = 1280, height: int = 720) -> Scene:
     """Two bright walls behind the objects: the local scene lights itself."""
-    environment, sun = sky_with_sun(50, 120, 0.6, (2, 2), clear=False)
+    environment, sun = sky_with_sun(50, 120, 0.6, (1, 2), clear=False)
     pose = looking((0.35, 1.5, 2.4), (-0.15, 0.25, 0.0))
     walls = [
         Wall("back", np.array([[-1.0, 0, -0.8], [3, 0, -0.8], [3, 3, -0.8], [-1.0, 3, -0.8]]), (0.75, 0.7, 0.6)),
