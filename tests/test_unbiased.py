@@ -1,0 +1,91 @@
+"""The fast strategy against the reference: z of tile means on four random scenes, and that a bias would be found.
+
+`benchmarks.zscore` does the same on twenty scenes with more samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.random_scenes import random_case
+from benchmarks.zscore import LIMIT, Tally, judged, share_out, tallied, tile_pixels, z_of
+
+SCENES = (4, 5, 6, 7)  # glossy with boxes, plane, boxes, walls; glass, rough glass, metal, mirror, emission; lamps
+CPU_S = 3.0
+
+
+@pytest.mark.parametrize("seed", SCENES)
+def test_fast_strategy_has_no_bias_and_one_of_a_tenth_would_be_seen(seed):
+    case = random_case(seed)
+    fast, reference, noobj = tallied(case, seed, CPU_S, spp=64)
+    found = judged(fast, reference, noobj)
+    assert found["zscore_max"] < LIMIT, case.name
+    # 144 squares of z, three channels alike: 48 independent ones scatter by 0.2 about 1; four times that.
+    assert found["zscore_square_mean"] < 1.8, case.name
+    assert abs(found["bias_rel"]) < 4 * found["bias_sigma_rel"]
+    brighter = replace(fast, values=fast.values * [1, 1, 1, 1.1, 1.1, 1.1])
+    assert judged(brighter, reference, noobj)["zscore_max"] > LIMIT
+
+
+def scattered(random: np.random.Generator, counts: np.ndarray, mean: np.ndarray, scale: float) -> Tally:
+    tile = np.repeat(np.arange(len(counts)), counts)
+    noise = random.gamma(2.0, size=(len(tile), 6)) - 2.0  # skewed, as light is
+    return Tally(tile, mean[tile] + scale * noise, len(counts))
+
+
+def test_z_of_equal_means_is_standard_normal_and_of_others_is_not():
+    """6000 z of few, skewed replicates: no larger than normal ones, the mean square 1 within four times its 0.02."""
+    random = np.random.default_rng(5)
+    mean = random.normal(size=(1000, 6))
+    few, many = random.integers(16, 40, 1000), random.integers(16, 200, 1000)
+    fast, reference = scattered(random, few, mean, 0.1), scattered(random, many, mean, 0.3)
+    z, sigma = z_of(fast, reference)
+    assert np.abs(z).max() < LIMIT
+    assert (z**2).mean() == pytest.approx(1, abs=0.08)
+    np.testing.assert_allclose(np.median(sigma), np.sqrt(2 * (0.01 / 27 + 0.09 / 107)), rtol=0.1)
+    off = replace(fast, values=fast.values + 0.5)
+    assert np.median(z_of(off, reference)[0]) > LIMIT
+
+
+def test_tally_knows_mean_and_standard_error():
+    tally = Tally(np.array([0, 0, 0, 2, 2]), np.repeat([[1.0], [2], [3], [5], [5]], 6, 1), 3)
+    mean, square = tally.of(tally.values)
+    np.testing.assert_allclose(mean[:, 0], [2, 0, 5])
+    np.testing.assert_allclose(square[:, 0], [1 / 3, 0, 0])
+
+
+def test_same_constants_agree_and_other_constants_never_do():
+    one = Tally(np.array([0, 0, 1, 1]), np.ones((4, 6)), 2)
+    other = replace(one, values=np.where(one.tile[:, None] == 1, 1.5, 1.0) * one.values)
+    z, _ = z_of(one, other)
+    assert np.all(z[0] == 0)
+    assert np.all(np.isinf(z[1]))
+
+
+def test_common_bias_is_measured():
+    """A tenth more light in every tile of one; the estimate agrees with it within four of its own standard errors."""
+    random = np.random.default_rng(6)
+    mean = -random.uniform(0.1, 1.0, (40, 6))
+    counts = np.full(40, 30)
+    fast, reference = scattered(random, counts, 1.1 * mean, 0.1), scattered(random, counts, mean, 0.1)
+    found = judged(fast, reference, np.ones((40, 3)))
+    assert found["bias_rel"] == pytest.approx(0.1, abs=4 * found["bias_sigma_rel"])
+    assert found["bias_sigma_rel"] < 0.02
+
+
+def test_effort_is_cut_off_at_one_height():
+    needed = np.array([1.0, 20.0, 100.0, 1e9])
+    np.testing.assert_array_equal(share_out(needed, 236), [16, 20, 100, 100])
+    np.testing.assert_array_equal(share_out(needed, 0), [16, 16, 16, 16])
+    np.testing.assert_array_equal(share_out(needed[:3], 10**6), [16, 20, 100])
+
+
+def test_tiles_are_eight_by_eight():
+    pixels = tile_pixels((17, 24))
+    assert pixels.shape == (6, 64)
+    rows, columns = np.divmod(pixels, 24)
+    assert np.ptp(rows, 1).max() == np.ptp(columns, 1).max() == 7
+    assert rows.max() == 15
