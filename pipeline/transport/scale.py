@@ -16,7 +16,6 @@ from pipeline.conventions import direction_from_latlong, latlong_solid_angles
 SIGMAS = 3.0  # by which a texel has to leave [0, 1] to count
 TOLERATED = 0.01  # share of the texels
 QUANTILE = 0.99
-COLOURED = 1.15  # ratio of the channels' factors that exposure cannot make
 UNKNOWN = 0.5  # relative uncertainty of a texel from which on its light is not known
 UNSURE = 0.02  # share of the irradiance from texels whose light is only a lower bound
 PATCHY = 0.1  # share of the texels above 1 up to which it is a highlight, not the scale
@@ -27,12 +26,12 @@ DARK = 0.02  # 99 % quantile below which nothing real is as dark in all channels
 class Disagreement:
     """Shares of texels outside [0, 1] beyond their noise, the curing factor on the map, and the likely cause.
 
-    ``cause`` is "" without disagreement; ``factor`` (3,) is 1 then.
+    ``cause`` is "" without disagreement, ``factor`` is 1 then. The excess's colour says nothing: it may be paint's.
     """
 
     above: float
     below: float
-    factor: np.ndarray
+    factor: float
     cause: str
 
 
@@ -55,15 +54,9 @@ def disagreement(albedo: np.ndarray, sigma: np.ndarray, unsure: float) -> Disagr
     """What albedo (N, 3) with noise ``sigma`` (N, 3) says about the scale; ``unsure`` is that of `unsure_share`."""
     above = float((albedo > 1 + SIGMAS * sigma).any(-1).mean())
     below = float((albedo < -SIGMAS * sigma).any(-1).mean())
-    high = np.quantile(albedo, QUANTILE, axis=0)
+    high = np.quantile(albedo, QUANTILE, axis=0).max()
     if above > TOLERATED:
-        factor = np.full(3, max(high.max(), 1.0))
-        if high.max() > COLOURED * high.min() > 0 and high.min() < 1:
-            factor = np.maximum(high, 1.0)
-            cause = (
-                "only some channels exceed it: the ball's reflectance colour, or white balance between ball and plate"
-            )
-        elif unsure > UNSURE:
+        if unsure > UNSURE:
             cause = (
                 f"{unsure:.0%} of the map's light is clipped or was not seen: a lamp's light is missing from the map"
             )
@@ -73,13 +66,13 @@ def disagreement(albedo: np.ndarray, sigma: np.ndarray, unsure: float) -> Disagr
             cause = (
                 "the whole plane exceeds it: exposure between plate and ball, or the ball's reflectance set too high"
             )
-        return Disagreement(above, below, factor, cause)
+        return Disagreement(above, below, float(high), cause)
     if below > TOLERATED:
-        return Disagreement(above, below, np.ones(3), "black level of the plate, or veiling glare taken off twice")
-    if 0 < high.max() < DARK:
+        return Disagreement(above, below, 1.0, "black level of the plate, or veiling glare taken off twice")
+    if 0 < high < DARK:
         cause = "nothing is so dark: exposure between plate and ball, or the ball's reflectance set too low"
-        return Disagreement(above, below, np.full(3, float(high.max())), cause)
-    return Disagreement(above, below, np.ones(3), "")
+        return Disagreement(above, below, float(high), cause)
+    return Disagreement(above, below, 1.0, "")
 
 
 def warning(found: Disagreement, lowest: np.ndarray) -> str | None:
@@ -95,6 +88,5 @@ def warning(found: Disagreement, lowest: np.ndarray) -> str | None:
             f"needed <= {TOLERATED:.0%}; likely {found.cause}"
         )
     else:
-        said = f"99 % of the seen texels lie below {found.factor.max():.4f}"
-    factor = ", ".join(f"{value:.2f}" for value in found.factor)
-    return f"albedo: {said}; likely {found.cause}; a map ({factor}) times as bright would cure it"
+        said = f"99 % of the seen texels lie below {found.factor:.4f}"
+    return f"albedo: {said}; likely {found.cause}; a map {found.factor:.2f} times as bright would cure it"

@@ -26,7 +26,7 @@ ASIDE = 0.15  # of its length, that a step may lie beside the line
 SPREAD = 0.12  # median absolute deviation of the lengths along one border
 MIN_BORDER = 12  # steps
 MIN_SHARE = 0.35  # of a region's border that has to agree
-MIN_AREA = 0.002  # of what is known
+MIN_AREA, MAX_AREA = 0.002, 0.5  # of what is known; where more is dark, the rest may as well be paint or a light
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def shadowed(picture: np.ndarray, fine: np.ndarray, ratio: np.ndarray) -> np.nda
         alike = LENGTH[0] < middle < LENGTH[1] and np.linalg.norm(aside) < ASIDE * size and spread < SPREAD
         if alike and len(jump) >= MIN_BORDER:
             agreeing[dark] += len(jump)
-    chosen = agreeing > MIN_SHARE * np.maximum(perimeter, 1)
+    chosen = (agreeing > MIN_SHARE * np.maximum(perimeter, 1)) & (area < MAX_AREA * fine.sum())
     chosen[0] = False
     return chosen[regions]
 
