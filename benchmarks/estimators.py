@@ -218,8 +218,8 @@ class Made:
 def insitu(stage: Loaded, plate: np.ndarray, knobs: Render, seed: int, every: bool) -> Iterator[Made]:
     """Region, passes, denoiser and the default composite, as the render stage makes them, from a loaded scene.
 
-    After the first pass and the last, or after ``every`` pass. The same samples also come without denoiser. Composing
-    is paid for once: a picture's seconds are those of the passes so far and of its own composite.
+    After the first pass and the last, or after ``every`` pass; the last also without denoiser. Composing is paid for
+    once: a picture's seconds are those of the passes so far and of its own composite.
     """
     height, width = stage.scene.camera.height, stage.scene.camera.width
     picture = plate.reshape(height, width, 3)
@@ -252,6 +252,8 @@ def insitu(stage: Loaded, plate: np.ndarray, knobs: Render, seed: int, every: bo
             break
         number, latest = number + 1, shot
         if number == 1 or every:
-            yield from (composed(shot, quiet, spent) for quiet in (True, False))
-    if latest is not None and number > 1 and not every:
-        yield from (composed(latest, quiet, spent) for quiet in (True, False))
+            yield composed(shot, True, spent)
+    if latest is not None:
+        if number > 1 and not every:
+            yield composed(latest, True, spent)
+        yield composed(latest, False, spent)

@@ -124,8 +124,9 @@ def write_page(record: dict[str, Any], folder: Path) -> None:
         lines += ["Cycles was left out: `make bench-cycles-env` installs it in an environment of its own.", ""]
     if "preview_cpu_s" in record:
         lines.append(
-            f"First complete composite of diffuse_glossy from a loaded scene, kernels cached: "
-            f"{record['preview_cpu_s']:.1f} CPU s, RMSE {record['preview_rmse_255']:.2f} / 255."
+            f"First complete composite of diffuse_glossy from a loaded scene, knobs of draft: "
+            f"{record['preview_cpu_s']:.1f} CPU s, RMSE {record['preview_rmse_255']:.2f} / 255; with nothing compiled "
+            f"yet {record['preview_cold_cpu_s']:.1f} CPU s."
         )
     tiny = record["tiny"]
     lines += [
