@@ -177,8 +177,9 @@ def lost_share(change: Change, plate: np.ndarray, plate_variance: np.ndarray) ->
     with f = |lost| / N, D = f (LS_b - N) the additive form's error (less what plate noise makes of it), V the variance
     of the lost light, B that of the plate, whose noise a shadow takes along as a ratio and keeps as a difference.
 
-    k is that of the surroundings (`WINDOW_PX`), not of the pixel: a choice that follows the pixel's own noise would
-    pick the smaller of two changes, everywhere, and wash the shadow out.
+    All of it, relative to N, is that of the surroundings (`WINDOW_PX`) and of the three channels together: a choice
+    that follows the pixel's own noise would pick the smaller of two changes, everywhere, and wash the shadow out; and
+    it would leave grain and hue in the layers. Only what keeps the result from turning negative is the pixel's own.
     """
     model, share = change.model, change.ground[..., None]
     has = (model > 0) & np.isfinite(plate_variance)
@@ -188,15 +189,19 @@ def lost_share(change: Change, plate: np.ndarray, plate_variance: np.ndarray) ->
     b = np.where(has, plate_variance, 0.0)
     excess = _surroundings(np.where(has, plate, 0.0)) / around - 1
     excess_noise = _surroundings(b) / (count * WINDOW_PX**2) / around**2
-    f = np.divide(-change.lost, change.without, out=np.zeros(plate.shape), where=change.without > 0)
-    v = _variances(change)[0] / np.where(share > 0, share, 1.0) ** 2
-    d = (f * safe) ** 2 * np.maximum(excess**2 - excess_noise, 0.0)
-    curvature = d + excess**2 * v + f**2 * b
-    t = np.divide(d - excess * v + f * b, curvature, out=np.ones(plate.shape), where=has & (curvature > 0))
+    f = np.divide(-change.lost, change.without, out=np.zeros(plate.shape), where=has & (change.without > 0))
+    v = np.where(has, _variances(change)[0], 0.0) / (np.where(share > 0, share, 1.0) * safe) ** 2
+    b = b / safe**2
+    d = f**2 * np.maximum(excess**2 - excess_noise, 0.0)
+    top, bottom = (
+        _surroundings(np.where(has, part, 0.0)).sum(-1, keepdims=True)
+        for part in (d - excess * v + f * b, d + excess**2 * v + f**2 * b)
+    )
+    t = np.divide(top, bottom, out=np.ones(top.shape), where=bottom > 0)
     # No less than what keeps the result from turning negative: LS_b (1 - t f) >= (1 - t) f N.
     short, gap = f * safe - np.maximum(plate, 0.0), f * (safe - plate)
     least = np.divide(short, gap, out=np.zeros(plate.shape), where=has & (short > 0) & (gap > 0))
-    return np.clip(np.maximum(t, least), 0.0, 1.0)
+    return np.clip(np.maximum(t, least.max(-1, keepdims=True)), 0.0, 1.0) + np.zeros(plate.shape)
 
 
 def predicted_error(rule: Rule, change: Change, plate: np.ndarray, plate_variance: np.ndarray) -> np.ndarray:
