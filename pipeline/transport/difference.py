@@ -21,8 +21,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipeline.transport.paths import trace_paths
 from pipeline.transport.scene import Worlds
-from pipeline.transport.trace import NEVER, Rays, Samples, camera_hits, collect, make_sampler
+from pipeline.transport.trace import Rays, Samples, camera_hits, collect, make_sampler
 
 CONE_SHARE = 0.5  # of the directions, where the BSDF is sampled too
 
@@ -41,15 +42,12 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     zero = mi.Color3f(0.0)
     lost, split, beta, behind = follow(worlds, sampler, hit, on_local, depth)
     # One path per sample: on from the camera where an object is seen, else along the direction that met an object.
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
     parted = dr.any(beta != 0)
-    onward = mi.RayDifferential3f(dr.select(on_object, ray.o, split.o), dr.select(on_object, ray.d, split.d))
-    found, _, _ = integrator.sample(worlds.with_objects, sampler, onward, active=on_object | parted)
+    onward = mi.Ray3f(dr.select(on_object, ray.o, split.o), dr.select(on_object, ray.d, split.d))
+    found = trace_paths(worlds, worlds.with_objects, sampler, onward, on_object | parted, depth)
     gained = dr.select(parted, found * beta, zero)
     if not worlds.convex:
-        covered, _, _ = integrator.sample(
-            worlds.without_objects, sampler, mi.RayDifferential3f(split.o, split.d), active=behind
-        )
+        covered = trace_paths(worlds, worlds.without_objects, sampler, split, behind, depth)
         lost -= dr.select(behind, covered * beta, zero)
     finite = dr.all(dr.isfinite(found)) & dr.all(dr.isfinite(lost)) & dr.all(dr.isfinite(gained))
     return collect(
@@ -130,7 +128,7 @@ def step(worlds: Worlds, sampler: Any, hit: Any, active: Any) -> tuple[Any, Any,
     cones = object_cones(worlds, origin)
     share = 1.0 if worlds.convex and worlds.diffuse else CONE_SHARE
     lost = mi.Color3f(0.0)
-    for group in worlds.lights:
+    for group in worlds.lights_above:
         light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(active), False, active)
         value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(light.d), active & (light.pdf > 0))
         lit = active & (light.pdf > 0) & (dr.dot(light.d, normal) > 0)
@@ -158,7 +156,7 @@ def hidden_light(worlds: Worlds, hit: Any, ray: Any, weight: Any, density: Any, 
 
     mi = worlds.mi
     total = mi.Color3f(0.0)
-    for group in worlds.lights:
+    for group in worlds.lights_above:
         if group.compact:
             continue
         emitter = group.scene.environment()

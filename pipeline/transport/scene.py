@@ -44,6 +44,7 @@ class Worlds:
     without_objects: Any
     local_with: tuple[Any, ...]
     lights: tuple[LightGroup, ...]
+    lights_above: tuple[LightGroup, ...]  # only what can reach the local scene, where that is a plane
     plane: Plane
     bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
     convex: bool = True
@@ -108,25 +109,30 @@ def bounding_sphere(shape: Any) -> np.ndarray:
     return np.array([*(low + high) / 2, np.linalg.norm(high - low) / 2])
 
 
-def light_groups(
-    mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray | None
-) -> tuple[LightGroup, ...]:
-    """The environment (H, W, 3) as a partition of its texels: the sky, then each emitter.
+def light_groups(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter]) -> tuple[LightGroup, ...]:
+    """The environment (H, W, 3) as a partition of its texels: the sky, then each emitter."""
+    sky = environment.reshape(-1, 3).copy()
+    lamps = []
+    for emitter in emitters:
+        texels = np.asarray(emitter.texels, int)
+        alone = np.zeros_like(sky)
+        alone[texels] = sky[texels]
+        sky[texels] = 0.0
+        lamps.append(light_group(mi, emitter.name, alone.reshape(environment.shape), True))
+    return (light_group(mi, "sky", sky.reshape(environment.shape), False), *lamps)
 
-    ``normal`` is given when only light from above that plane can matter.
-    """
-    useful = environment if normal is None else above_plane(environment, normal)
-    owner = np.zeros(environment.shape[:2], int).ravel()
-    for number, emitter in enumerate(emitters, 1):
-        owner[np.asarray(emitter.texels, int)] = number
-    owner = owner.reshape(environment.shape[:2])
-    groups = []
-    for number, name in enumerate(["sky", *(emitter.name for emitter in emitters)]):
-        part = np.where((owner == number)[..., None], useful, 0.0)
-        if part.any() or number == 0:
-            distant = environment_emitter(mi, part)
-            groups.append(LightGroup(name, mi.load_dict({"type": "scene", "distant": distant}), number > 0))
-    return tuple(groups)
+
+def light_group(mi: Any, name: str, radiance: np.ndarray, compact: bool) -> LightGroup:
+    """A scene with nothing but this light."""
+    return LightGroup(name, mi.load_dict({"type": "scene", "distant": environment_emitter(mi, radiance)}), compact)
+
+
+def sky_above(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray) -> LightGroup:
+    """The sky without what lies below the plane and never reaches it."""
+    sky = environment.copy()
+    for emitter in emitters:
+        sky.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0.0
+    return light_group(mi, "sky", above_plane(sky, normal), False)
 
 
 def ground_bsdf(mi: Any, albedo: np.ndarray, surface: Surface | None) -> dict[str, Any]:
@@ -189,13 +195,15 @@ def build_worlds(
         shapes |= {f"proxy_{proxy.name}": proxy_shape(mi, proxy, proxy.albedo) for proxy in proxies}
         scenes.append((mi.load_dict({**shared, **shapes, **synthetic}), tuple(shapes.values())))
     (with_objects, local_with), (without, _) = scenes
+    lights = light_groups(mi, environment, emitters)
     hiding = {f"occluder_{o.name}": proxy_shape(mi, o, None) for o in occluders if o.vertices_m is not None}
     return Worlds(
         mi=mi,
         with_objects=with_objects,
         without_objects=without,
         local_with=local_with,
-        lights=light_groups(mi, environment, emitters, None if proxies else plane.normal),
+        lights=lights,
+        lights_above=lights if proxies else (sky_above(mi, environment, emitters, plane.normal), *lights[1:]),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
         convex=not proxies,
