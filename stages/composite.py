@@ -7,6 +7,7 @@ given as masks take their share back. Every guard that fires is counted and mark
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ GUARDS = {
     "edge_of_model": d.EDGE_OF_MODEL,
     "unseen_albedo": d.UNSEEN_ALBEDO,
 }
+PREDICTED_PX = 20_000  # pixels whose predicted error is asked for
 REBUILD = "R,G,B = plate * mul + add + obj"
 REBUILD_GROUPS = "mul = 1 - obj.A + sum(mul.g - 1); add = sum(add.g); obj = sum(obj.g)"
 RELIGHT = (
@@ -56,8 +58,8 @@ def rule_of(kind: str, change: d.Change, plate: Raster) -> d.Rule:
 
 def compose(
     plate: Raster, layers: Raster, kind: str, mask: np.ndarray | None = None, half: bool = False
-) -> tuple[np.ndarray, d.Layers]:
-    """The composite (H, W, 3) float32 and its layers, guards complete.
+) -> tuple[np.ndarray, d.Layers, d.Rule]:
+    """The composite (H, W, 3) float32, its layers, guards complete, and the rule that they follow.
 
     Args:
         plate: R G B, variance, mask.
@@ -67,7 +69,8 @@ def compose(
         half: round ``mul`` to 16 bit, so that what is stored rebuilds the result.
     """
     change, rgb = change_of(layers), plate.rgb()
-    built = d.build(change, rule_of(kind, change, plate))
+    rule = rule_of(kind, change, plate)
+    built = d.build(change, rule)
     built = d.flagged(built, d.EDGE_OF_MODEL, d.edge_of_model(change, layers["influence"]))
     if mask is not None:
         built = built.behind(mask)
@@ -76,7 +79,7 @@ def compose(
     picture = built.apply(rgb)
     built = d.flagged(built, d.NEGATIVE, ((picture < 0) & (rgb >= 0)).max(-1))
     clipped = built.touched & (built.alpha < 1) & ((plate["mask"] & CLIPPED) > 0)
-    return picture, d.flagged(built, d.CLIPPED_PLATE, np.asarray(clipped))
+    return picture, d.flagged(built, d.CLIPPED_PLATE, np.asarray(clipped)), rule
 
 
 def in_front(occluders: list[Occluder], shape: tuple[int, int]) -> np.ndarray | None:
@@ -146,14 +149,18 @@ def group_shares(
     return {name: rest if name == "sky" else shares[name] for name in names}
 
 
-def predicted(change: d.Change, plate: Raster) -> dict[str, float]:
-    """Median predicted error of each kind over the pixels that change visibly, relative to the plate."""
-    rgb, variance = plate.rgb(), plate.rgb("variance")
-    visible = (np.abs(change.difference) > d.SEEN_CHANGE * change.without) & (rgb > 0)
+def predicted(change: d.Change, rule: d.Rule, plate: Raster) -> dict[str, float]:
+    """Median predicted error, relative to the plate, of (4), (5) and ``rule`` where light changes visibly."""
+    row, column = np.nonzero((np.abs(change.difference) > d.SEEN_CHANGE * change.without).any(-1))
+    row, column = (index[:: len(index) // PREDICTED_PX + 1] for index in (row, column))
+    some = d.picked(change, row, column)
+    rgb, variance = (plate.rgb(layer)[row, column][:, None] for layer in ("", "variance"))
+    taken = {name: getattr(rule, name)[row, column][:, None] for name in ("lost_share", "gained_share", "gain")}
+    rules = {"additive": d.additive(some), "ratio": d.ratio(some), "taken": replace(rule, **taken)}
     found = {}
-    for kind in ("additive", "ratio", "auto"):
-        error = d.predicted_error(rule_of(kind, change, plate), change, rgb, variance)
-        known = visible & np.isfinite(error)
+    for kind, one in rules.items():
+        error = d.predicted_error(one, some, rgb, variance)
+        known = np.isfinite(error) & (rgb > 0)
         if known.any():
             found[f"predicted_error_{kind}"] = float(np.median(np.sqrt(error[known]) / rgb[known]))
     return found
@@ -177,7 +184,7 @@ def compute(
     """
     plate = photographs["plate"]
     mask = in_front(occluders, plate.shape)
-    picture, built = compose(plate, layers, params.kind, mask, params.half)
+    picture, built, rule = compose(plate, layers, params.kind, mask, params.half)
     change = change_of(layers)
     unseen = unseen_albedo(change, camera, views["plate"], plane, albedo)
     built = d.flagged(built, d.UNSEEN_ALBEDO, unseen if mask is None else unseen & (mask < 1))
@@ -190,7 +197,7 @@ def compute(
         "guards": built.guards,
     }
     attributes = {"insitu:layers": REBUILD}
-    groups = group_layers(change, rule_of(params.kind, change, plate), layers, mask)
+    groups = group_layers(change, rule, layers, mask)
     for name, group in groups.items():
         for layer in ("mul", "add", "obj"):
             channels |= Raster.split(getattr(group, layer), f"{layer}.{name}")
@@ -211,7 +218,7 @@ def compute(
     numbers["touched_fraction"] = float((picture != plate.rgb()).any(-1).mean())
     numbers["not_finite_px"] = int((~np.isfinite(picture)).any(-1).sum())
     numbers["exposure_ev"] = exposure
-    numbers |= predicted(change, plate)
+    numbers |= predicted(change, rule, plate)
     if mask is not None:
         numbers["occluded_fraction"] = float(mask.mean())
     looking = (params.display, params.view, exposure, params.look)

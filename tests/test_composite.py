@@ -105,7 +105,7 @@ def family(seed: int, albedo: float = 0.35, light: float = 0.2, noise: float = 0
 
 def errors(case: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
     """p95 of |result / truth - 1| of each form and regime."""
-    block = 2 * d.WINDOW_PX - 1  # every case fills what is averaged, as a neighbourhood does; its middle is looked at
+    block = 5 * d.BLOCK_PX  # every case fills what is averaged, as a neighbourhood does; its middle is looked at
 
     def image(values: np.ndarray) -> np.ndarray:
         return np.repeat(np.repeat(values, block)[:, None, None], 3, -1)

@@ -42,7 +42,7 @@ GAIN_RANGE = (0.5, 2.0)
 HALF_MAX = 65504.0
 ALBEDO_SIGMA = 0.35  # of log albedo, prior
 IRRADIANCE_SIGMA = 0.2  # of log irradiance, prior
-WINDOW_PX = 9  # over which plate and model are compared to choose a form
+BLOCK_PX = 3  # plate and model are compared over three such blocks to choose a form
 FAINT_MODEL = 1e-4  # of the median LS_noobj: below this a ratio is not formed
 SEEN_CHANGE = 0.01  # of LS_noobj: what is cut off at the border of the model is worth telling from here on
 
@@ -177,31 +177,40 @@ def lost_share(change: Change, plate: np.ndarray, plate_variance: np.ndarray) ->
     with f = |lost| / N, D = f (LS_b - N) the additive form's error (less what plate noise makes of it), V the variance
     of the lost light, B that of the plate, whose noise a shadow takes along as a ratio and keeps as a difference.
 
-    All of it, relative to N, is that of the surroundings (`WINDOW_PX`) and of the three channels together: a choice
-    that follows the pixel's own noise would pick the smaller of two changes, everywhere, and wash the shadow out; and
-    it would leave grain and hue in the layers. Only what keeps the result from turning negative is the pixel's own.
+    All of it, relative to N, is that of the surroundings (3 by 3 blocks of `BLOCK_PX`) and of the three channels
+    together: a choice that follows the pixel's own noise would pick the smaller of two changes, everywhere, and wash
+    the shadow out; and it would leave grain and hue in the layers. Only what keeps the result from turning negative is
+    the pixel's own.
     """
-    model, share = change.model, change.ground[..., None]
-    has = (model > 0) & np.isfinite(plate_variance)
-    safe = np.where(has, model, 1.0)
-    count = np.maximum(_surroundings(has.astype(float)), 1e-9)
-    around = np.maximum(_surroundings(np.where(has, model, 0.0)), 1e-30)
-    b = np.where(has, plate_variance, 0.0)
-    excess = _surroundings(np.where(has, plate, 0.0)) / around - 1
-    excess_noise = _surroundings(b) / (count * WINDOW_PX**2) / around**2
-    f = np.divide(-change.lost, change.without, out=np.zeros(plate.shape), where=has & (change.without > 0))
-    v = np.where(has, _variances(change)[0], 0.0) / (np.where(share > 0, share, 1.0) * safe) ** 2
-    b = b / safe**2
-    d = f**2 * np.maximum(excess**2 - excess_noise, 0.0)
-    top, bottom = (
-        _surroundings(np.where(has, part, 0.0)).sum(-1, keepdims=True)
-        for part in (d - excess * v + f * b, d + excess**2 * v + f**2 * b)
-    )
-    t = np.divide(top, bottom, out=np.ones(top.shape), where=bottom > 0)
+    has = (change.model > 0) & np.isfinite(plate_variance)
+    weight = np.where(has, change.ground[..., None], 0)
+    noise = np.where(has, plate_variance, 0) * weight**2
+    parts = (change.without, plate * weight, noise, -change.lost, _variances(change)[0])
+    n, p, b, lost, v = (_blocks(np.where(has, part, 0)) for part in parts)
+    around = np.maximum(_surroundings(n), 1e-30)
+    excess = _surroundings(p) / around - 1
+    # Variances are of sums over blocks; what stays of the plate's in the surroundings is less by their 9 blocks.
+    d = (lost / np.maximum(n, 1e-30)) ** 2 * np.maximum(excess**2 - _surroundings(b) / 9 / around**2, 0)
+    f, v, b = (part / np.maximum(n, 1e-30) ** power for part, power in ((lost, 1), (v, 2), (b, 2)))
+    v, b = v * BLOCK_PX**2, b * BLOCK_PX**2  # of a pixel
+    top = _surroundings(d - excess * v + f * b).sum(-1, keepdims=True)
+    bottom = _surroundings(d + excess**2 * v + f**2 * b).sum(-1, keepdims=True)
+    coarse = np.divide(top, bottom, out=np.ones_like(top), where=bottom > 0)
+    height, width = plate.shape[:2]
+    t = coarse.repeat(BLOCK_PX, 0).repeat(BLOCK_PX, 1)[:height, :width]
     # No less than what keeps the result from turning negative: LS_b (1 - t f) >= (1 - t) f N.
-    short, gap = f * safe - np.maximum(plate, 0.0), f * (safe - plate)
-    least = np.divide(short, gap, out=np.zeros(plate.shape), where=has & (short > 0) & (gap > 0))
-    return np.clip(np.maximum(t, least.max(-1, keepdims=True)), 0.0, 1.0) + np.zeros(plate.shape)
+    dark = change.ground[..., None] * np.maximum(plate, 0)
+    short = np.where(has, -change.lost - dark, 0)
+    at_risk = (short > 0) & (dark < change.without)
+    gap = np.where(at_risk, -change.lost * (1 - dark / np.where(at_risk, change.without, 1)), 1)
+    least = np.where(at_risk, short / gap, 0).max(-1, keepdims=True)
+    return np.broadcast_to(np.clip(np.maximum(t, least), 0, 1), plate.shape)
+
+
+def picked(change: Change, row: np.ndarray, column: np.ndarray) -> Change:
+    """Some pixels (N,) of a change, as a picture (N, 1)."""
+    parts = {name: values[row, column][:, None] for name, values in vars(change).items() if np.ndim(values)}
+    return replace(change, **parts)
 
 
 def predicted_error(rule: Rule, change: Change, plate: np.ndarray, plate_variance: np.ndarray) -> np.ndarray:
@@ -253,11 +262,9 @@ def build_group(change: Change, rule: Rule, lost: np.ndarray, gained: np.ndarray
 
 def edge_of_model(change: Change, influence: np.ndarray) -> np.ndarray:
     """(H, W) bool: changed pixels next to ones, inside the region of influence, that the local scene does not reach."""
-    from scipy.ndimage import binary_dilation
-
     outside = (influence > 0) & (change.ground + change.alpha < 0.5)
     changed = (np.abs(change.difference) > SEEN_CHANGE * change.without).any(-1) & (change.ground > 0)
-    return changed & binary_dilation(outside, np.ones((3, 3), bool))
+    return changed & (_surroundings(outside.astype(np.float32)) > 0)
 
 
 def _parts(change: Change, lost: np.ndarray, gained: np.ndarray, rule: Rule) -> tuple[np.ndarray, np.ndarray]:
@@ -268,11 +275,23 @@ def _parts(change: Change, lost: np.ndarray, gained: np.ndarray, rule: Rule) -> 
     return relative * share, (1 - t) * lost + (1 - u) * rule.gain * gained
 
 
-def _surroundings(values: np.ndarray) -> np.ndarray:
-    """Mean (H, W, 3) over a square window, what lies outside the frame counting as zero."""
-    from scipy.ndimage import uniform_filter
+def _blocks(values: np.ndarray) -> np.ndarray:
+    """Sums (h, w, 3) over blocks of `BLOCK_PX`, what lies outside the frame counting as zero."""
+    height, width = (-(-size // BLOCK_PX) * BLOCK_PX for size in values.shape[:2])
+    padded = np.zeros((height, width, values.shape[2]))
+    padded[: values.shape[0], : values.shape[1]] = values
+    return padded.reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX, -1).sum((1, 3))
 
-    return uniform_filter(values, (WINDOW_PX, WINDOW_PX, 0), mode="constant")
+
+def _surroundings(values: np.ndarray) -> np.ndarray:
+    """Mean (h, w, ...) over the 3 by 3 neighbours of every entry, zero outside the frame."""
+    for axis in (0, 1):
+        total = values.copy()
+        low, high = (tuple([slice(None)] * axis + [part]) for part in (slice(None, -1), slice(1, None)))
+        total[high] += values[low]
+        total[low] += values[high]
+        values = total
+    return values / 9
 
 
 def _variances(change: Change) -> tuple[np.ndarray, np.ndarray]:
