@@ -7,38 +7,48 @@ does nothing, averaged over independent seeds; it is given relative to the true 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from benchmarks.random_scenes import Case, random_case
-from pipeline.transport.denoise import tile_means
+from pipeline.transport.denoise import TILE, tile_means
 from pipeline.transport.difference import difference_block
 from pipeline.transport.estimate import Canvas, Effort, pictures, prepare, sampled
 from pipeline.transport.passes import Halves
 from pipeline.transport.region import limits_for
-from pipeline.transport.trace import trace
+from pipeline.transport.trace import trace, unchanged_block
 
 SHAPE, FOV_DEG = (96, 144), 80.0
 SEEDS, SAMPLES, TRUTH_SAMPLES, DEPTH = 6, 48, 512, 12
 PLATE_NOISE, THRESHOLD = 0.01, 0.004  # of the photograph; the knob's default
 # Where an effect counts: change over LS_noobj (the region cuts what is fainter than the rest), share of an object.
 CHANGED, FAINT, SHOWN = 0.01, 0.001, 0.5
+KNOWN = 5.0  # standard errors of the truth by which a change must differ from none
 Effects = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """An effect (seeds, N) on the tiles where it counts, their true value and LS_noobj (N,); means of the channels."""
+
+    effect: np.ndarray
+    true: np.ndarray
+    noobj: np.ndarray
 
 
 def measured_apart(scenes: int) -> dict[str, dict[str, float]]:
     """Figures of every effect, over all changed tiles of the first ``scenes`` random scenes.
 
-    ``rms``, ``p95`` of the effect over the change, ``net`` of the sums over all tiles, and ``noise``: the rms that the
-    scatter between seeds alone leaves in ``rms``.
+    ``rms``, ``median`` and ``p95`` of the effect over the change, ``net`` of the sums over all tiles, ``noise``: what
+    the scatter between seeds alone leaves in ``rms``; ``p95_of_noobj``: over LS_noobj.
     """
     found = [effects_of(random_case(seed, SHAPE, FOV_DEG), seed) for seed in range(scenes)]
     return {name: figures([one[name] for one in found]) for name in (found[0] if found else {})}
 
 
-def effects_of(case: Case, seed: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Per effect: (seeds, N) effect and (N,) true value of the tiles where it counts; means of the channels."""
+def effects_of(case: Case, seed: int) -> dict[str, Told]:
+    """Every effect in one scene."""
     truth = trace(difference_block, case.worlds, case.rays, TRUTH_SAMPLES, DEPTH, 11 + seed)
     change = (truth.lost + truth.gained).reshape(*case.shape, 3)
     obj, alpha = truth.obj.reshape(*case.shape, 3), truth.alpha.reshape(case.shape)
@@ -48,15 +58,20 @@ def effects_of(case: Case, seed: int) -> dict[str, tuple[np.ndarray, np.ndarray]
         canvas = planned(case, truth.albedo, effort)
         noobj, effects = quieting(traced_everywhere(canvas))
         rows.append({"region": grey(cut(canvas, change, noobj) - change), **effects})
-    true_change, true_obj = grey(change), grey(obj)
-    relative = np.abs(true_change) / np.maximum(grey(noobj), 1e-9)
-    places = {"region": relative > FAINT, "change": relative > CHANGED, "objects": tile_means(alpha) > SHOWN}
+    true = {"change": grey(change), "objects": grey(obj)}
+    bare = trace(unchanged_block, case.worlds, case.rays, SAMPLES, DEPTH, 12 + seed).without
+    level = np.maximum(grey(bare.reshape(*case.shape, 3)), 1e-9)
+    sigma = np.sqrt(tile_means(truth.change_variance.max(-1).reshape(case.shape))) / TILE
+    places = {
+        "region": np.abs(true["change"]) > np.maximum(FAINT * level, KNOWN * sigma),
+        "change": np.abs(true["change"]) > CHANGED * level,
+        "objects": tile_means(alpha) > SHOWN,
+    }
 
-    def told(name: str) -> tuple[np.ndarray, np.ndarray]:
-        what = "objects" if "objects" in name else "region" if name == "region" else "change"
-        return np.stack([row[name][places[what]] for row in rows]), (true_obj if what == "objects" else true_change)[
-            places[what]
-        ]
+    def told(name: str) -> Told:
+        what = "objects" if "objects" in name else "change"
+        where = places["region" if name == "region" else what]
+        return Told(np.stack([row[name][where] for row in rows]), true[what][where], level[where])
 
     return {name: told(name) for name in rows[0]}
 
@@ -108,13 +123,16 @@ def cut(canvas: Canvas, truth: np.ndarray, noobj: np.ndarray) -> np.ndarray:
     return np.where(canvas.region.interpolated[..., None], smooth, truth) * canvas.region.weight[..., None]
 
 
-def figures(parts: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
-    """Of effects (seeds, N) and true values (N,) of several scenes."""
-    effects = np.concatenate([effect for effect, _ in parts], 1)
-    size = np.abs(np.concatenate([true for _, true in parts]))
-    mean, noise = effects.mean(0) / size, effects.std(0, ddof=1) / np.sqrt(SEEDS) / size
+def figures(parts: list[Told]) -> dict[str, float]:
+    """Of one effect in several scenes."""
+    effects = np.concatenate([part.effect for part in parts], 1)
+    size = np.abs(np.concatenate([part.true for part in parts]))
+    noobj = np.concatenate([part.noobj for part in parts])
+    mean = effects.mean(0)
+    noise = effects.std(0, ddof=1) / np.sqrt(SEEDS) / size
     return {
-        "rms": float(np.sqrt((mean**2).mean())), "median": float(np.median(np.abs(mean))),
-        "p95": float(np.quantile(np.abs(mean), 0.95)), "net": float(effects.mean(0).sum() / size.sum()),
-        "noise": float(np.sqrt((noise**2).mean())), "tiles": len(size),
+        "rms": float(np.sqrt(((mean / size) ** 2).mean())), "median": float(np.median(np.abs(mean) / size)),
+        "p95": float(np.quantile(np.abs(mean) / size, 0.95)), "net": float(mean.sum() / size.sum()),
+        "noise": float(np.sqrt((noise**2).mean())), "p95_of_noobj": float(np.quantile(np.abs(mean) / noobj, 0.95)),
+        "tiles": len(size),
     }  # fmt: skip
