@@ -11,6 +11,7 @@ from pipeline.light.environment import irradiance
 from pipeline.run.manifest import MaterialWish
 from pipeline.transport.conductors import REFLECTANCE, preset
 from pipeline.transport.meshes import Material, Mesh
+from pipeline.transport.paths import trace_paths
 from pipeline.transport.scene import build_worlds
 from pipeline.transport.surfaces import area_emitter, material_bsdf, object_shape
 from pipeline.transport.variant import use_mitsuba
@@ -367,8 +368,13 @@ def test_a_glowing_texture_needs_no_unique_coordinates() -> None:
     shape, _ = object_shape(mi, "o", mesh, np.eye(4), material, "acescg", 1.0)
     edges = np.array([[-2, 0, 2], [2, 0, 2], [2, 0, -2], [-2, 0, -2]], float)
     plane = Plane(normal=[0, 1, 0], offset_m=0.0, covariance=np.zeros((3, 3)), corners_m=edges, source="test")
-    worlds = build_worlds(plane, np.full(3, 1.0), np.zeros((16, 32, 3)), {"o": shape})
-    light = seen(worlds.with_objects, np.tile([[0.0, 0.2, 0.0]], (1 << 18, 1)), (0, -1, 0), 2)
+    worlds = build_worlds(plane, np.full(3, 1.0), np.full((16, 32, 3), 1e-6), {"o": shape})
+    below = np.tile([[0.0, 0.2, 0.0]], (1 << 18, 1))
     # u runs 0 to 1 over each triangle and the glowing half is u < 1/2: a quarter of it, at the corner where u = 0.
     expected = 4.0 * 0.04 / np.pi * 0.25
-    assert abs(light.mean() - expected) < 5 * light.std() / 512 + 0.02 * expected
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(3, len(below))
+    rays = mi.Ray3f(mi.Point3f(0.0, 0.2, 0.0), mi.Vector3f(0.0, -1.0, 0.0))
+    own = trace_paths(worlds, worlds.with_objects, sampler, rays, mi.Bool(np.ones(len(below), bool)), 2)
+    for light in (seen(worlds.with_objects, below, (0, -1, 0), 2), np.array(own)):
+        assert abs(light.mean() - expected) < 5 * light.std() / 512 + 0.02 * expected

@@ -45,6 +45,8 @@ def trace_paths(
     mi = worlds.mi
     context = mi.BSDFContext()
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
+    # Textured lights are not sampled, see `pipeline.transport.surfaces.area_emitter`.
+    aimed = [lamp for lamp in lamps if mi.traverse(lamp)["sampling_weight"] > 0]
     width = dr.width(active)
 
     def body(*state: Any) -> tuple[Any, ...]:
@@ -55,7 +57,8 @@ def trace_paths(
         found += dr.select(escaped, through * _distant(worlds, ray.d, escaped, density, delta, left), 0.0)
         given = active & hit.is_valid()
         for lamp in lamps:
-            found += dr.select(given, through * _seen(worlds, scene, lamp, hit, ray, given, density, delta), 0.0)
+            alone = delta if lamp in aimed else mi.Bool(True)
+            found += dr.select(given, through * _seen(worlds, scene, lamp, hit, ray, given, density, alone), 0.0)
         onward = given & (length + 1 < depth)
         bsdf = hit.bsdf()
         smooth = onward & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -69,7 +72,7 @@ def trace_paths(
                 shared = lit & caustic.active & (length == 0)
                 weight = dr.select(shared, 1 / (1 + caustic.against(hit, ray, light.d)), weight)
             found += dr.select(lit, through * value * radiance * weight, 0.0)
-        for lamp in lamps:
+        for lamp in aimed:
             light, radiance = lamp.sample_direction(hit, sampler.next_2d(smooth), smooth)
             lit = smooth & (light.pdf > 0)
             lit &= ~scene.ray_test(hit.spawn_ray_to(light.p), lit)
@@ -117,13 +120,13 @@ def _distant(worlds: Worlds, direction: Any, active: Any, density: Any, delta: A
     return total
 
 
-def _seen(worlds: Worlds, scene: Any, lamp: Any, hit: Any, ray: Any, active: Any, density: Any, delta: Any) -> Any:
-    """Light that a ray, drawn with ``density``, meets on a light-giving object."""
+def _seen(worlds: Worlds, scene: Any, lamp: Any, hit: Any, ray: Any, active: Any, density: Any, alone: Any) -> Any:
+    """Light that a ray, drawn with ``density``, meets on a light-giving object; ``alone``: nothing else finds it."""
     import drjit as dr
 
     mi = worlds.mi
     met = active & (hit.emitter(scene, active) == mi.EmitterPtr(lamp))
     start = dr.zeros(mi.Interaction3f)
     start.p = ray.o
-    pdf = dr.select(delta, 0.0, lamp.pdf_direction(start, mi.DirectionSample3f(scene, hit, start), met))
-    return dr.select(met, lamp.eval(hit, met) * dr.select(delta, 1.0, density / (density + pdf)), 0.0)
+    pdf = dr.select(alone, 0.0, lamp.pdf_direction(start, mi.DirectionSample3f(scene, hit, start), met))
+    return dr.select(met, lamp.eval(hit, met) * dr.select(alone, 1.0, density / (density + pdf)), 0.0)
