@@ -29,6 +29,7 @@ WINDOW = 16  # px, side of the window of the error estimates
 SPECKLE_GAIN = 4.0  # a pixel may exceed what its surroundings and the other half show by this factor
 SPECKLE_SCALES = (2.0, 5.0, 12.0)  # px, standard deviations over which the excess goes
 SPECKLES_TOGETHER = 2  # in each half, so many speckles must overlap at a scale
+FAINT_SPECKLE = 1 / 12  # bound over value: spread over 12 px, the glow stays below 5 % of what the surroundings show
 LINEAR_SRGB = 0.0031308  # of display white, below which the curve of IEC 61966-2-1 is a line
 
 
@@ -90,10 +91,10 @@ def spread_speckles(half_a: np.ndarray, half_b: np.ndarray, support: np.ndarray)
     A pixel is a speckle where it exceeds four times both the median of its 3 x 3 pixels and the brightest of them
     *in the other half*: a highlight that both halves see is left alone, however small. The excess goes to a Gaussian,
     as narrow as lets two speckles *of each half* overlap, at most 12 px wide: a sparsely sampled caustic becomes an
-    even one. What finds no such company in the other half is held back: one path does not tell where its light
-    belongs. The bias is bounded and counted: no light goes further than 48 px or off the support; a tile loses at most
-    the excess of its own speckles (`Quiet.moved`, `Quiet.held_back`); halves that agree within a factor of four are not
-    touched at all, so it vanishes with more samples.
+    even one. What finds no such company goes to 12 px too where that glow is faint; else it is held back: one path does
+    not tell where its light belongs. The bias is bounded and counted: no light goes further than 48 px or off the
+    support; a tile loses at most the excess of its own speckles (`Quiet.moved`, `Quiet.held_back`); halves that agree
+    within a factor of four are not touched at all, so it vanishes with more samples.
 
     Args:
         half_a: (H, W, 3) float32, >= 0.
@@ -114,7 +115,8 @@ def spread_speckles(half_a: np.ndarray, half_b: np.ndarray, support: np.ndarray)
     results = [half * share[..., None] for half, share in zip(halves, kept, strict=True)]
     for scale in SPECKLE_SCALES:
         overlap = np.minimum(blur(speckles[0], scale), blur(speckles[1], scale)) * 2 * np.pi * scale**2
-        now = waiting & (overlap >= SPECKLES_TOGETHER)
+        faint = (np.minimum(*kept) > FAINT_SPECKLE) & (scale == SPECKLE_SCALES[-1])
+        now = waiting & ((overlap >= SPECKLES_TOGETHER) | faint)
         waiting &= ~now
         if now.any():
             # Divided by what a kernel finds of the support, multiplied by the support: nothing falls off it.
