@@ -93,6 +93,9 @@ def test_lights_of_a_real_render_rebuild_the_picture(tmp_path: Path) -> None:
     scale = plate + np.abs(add) + obj
     assert np.all(np.abs(plate * mul + add + obj - stored.rgb()) <= 16 * np.finfo(np.float32).eps * scale)
 
+    gold = layers.rgb("obj.lamp_1")[:, :20].mean() / layers.rgb("obj.sky")[:, :20].mean()
+    assert 0.5 < gold < 5  # the lamp gives 2/3 of the irradiance here: neither group is empty
+
     white = luminance(irradiance(sky(), np.array([[0.0, 1, 0]]))[0]) / np.pi
     (column, row), *_ = project(camera(), transform_points(invert_rigid(looking_down()), np.array([[0.2, 0.09, 0.0]])))
     around = np.hypot(*np.meshgrid(np.arange(64) + 0.5 - column, np.arange(48) + 0.5 - row)) < 12

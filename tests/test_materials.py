@@ -368,7 +368,7 @@ def test_a_glowing_texture_needs_no_unique_coordinates() -> None:
     shape, _ = object_shape(mi, "o", mesh, np.eye(4), material, "acescg", 1.0)
     edges = np.array([[-2, 0, 2], [2, 0, 2], [2, 0, -2], [-2, 0, -2]], float)
     plane = Plane(normal=[0, 1, 0], offset_m=0.0, covariance=np.zeros((3, 3)), corners_m=edges, source="test")
-    worlds = build_worlds(plane, np.full(3, 1.0), np.full((16, 32, 3), 1e-6), {"o": shape})
+    worlds = build_worlds(plane, np.full(3, 1.0), np.zeros((16, 32, 3)), {"o": shape})
     below = np.tile([[0.0, 0.2, 0.0]], (1 << 18, 1))
     # u runs 0 to 1 over each triangle and the glowing half is u < 1/2: a quarter of it, at the corner where u = 0.
     expected = 4.0 * 0.04 / np.pi * 0.25
