@@ -43,6 +43,7 @@ MAP = (64, 128)
 SIZE = (32, 48)  # rows, columns
 LIFT = 0.02  # m: flat undersides do not lie in the plane, where either could be hit first
 EXTENT_M = 30.0
+TARGET = (1.0, 0.3, 0.4)  # between the middle and the first object
 UP = np.array([[0.0, 1.0, 0.0]])
 
 
@@ -88,7 +89,7 @@ def random_case(seed: int, shape: tuple[int, int] = SIZE, fov_deg: float = 42.0)
     azimuth = random.uniform(0.1, 1.4) if kind == "walls" else random.uniform(0, 2 * np.pi)
     eye = 9.0 * np.array([np.sin(azimuth), random.uniform(0.7, 1.2), np.cos(azimuth)])
     xn, dxn = ray_grid(pinhole(shape[1], shape[0], fov_deg))
-    pose = looking(tuple(eye), (0.0, 0.3, 0.0))
+    pose = looking(tuple(eye), TARGET)
     rays = Rays.of(pose, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
     lit = f"{lamps} lamps" + (f", {len(emitters)} apart" if emitters else "")
     return Case(f"{kind}: {', '.join(chosen)}; {lit}", worlds, rays, shape, light)

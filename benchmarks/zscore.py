@@ -1,6 +1,6 @@
 """Is the fast strategy unbiased? Fast minus reference on random scenes, over the standard error of the difference.
 
-    /path/to/python -m benchmarks.zscore [scenes]
+    .venv/bin/python -m benchmarks.zscore [scenes]
 
 Both strategies estimate the change of the local scene and the object layer on tiles of 8 x 8 pixels. A *replicate* is
 the mean of a tile over ``spp`` samples per pixel with a seed of its own; means and standard errors come from the

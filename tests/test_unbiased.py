@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.deliberate import Told, figures
 from benchmarks.random_scenes import random_case
 from benchmarks.zscore import LIMIT, Tally, judged, share_out, tallied, tile_pixels, z_of
 
@@ -89,3 +90,18 @@ def test_tiles_are_eight_by_eight():
     rows, columns = np.divmod(pixels, 24)
     assert np.ptp(rows, 1).max() == np.ptp(columns, 1).max() == 7
     assert rows.max() == 15
+
+
+def test_figures_of_a_deliberate_bias():
+    """A tenth too little in every tile, with noise between the seeds that the figures tell apart."""
+    random = np.random.default_rng(7)
+    true = random.uniform(0.1, 1.0, 400)
+    effect = -0.1 * true + 0.02 * true * random.normal(size=(6, 400))
+    found = figures(
+        [Told(effect[:, :150], true[:150], 2 * true[:150]), Told(effect[:, 150:], true[150:], 2 * true[150:])]
+    )
+    assert found["net"] == pytest.approx(-0.1, abs=4 * 0.02 / np.sqrt(6 * 400))
+    assert found["noise"] == pytest.approx(0.02 / np.sqrt(6), rel=0.1)
+    assert found["rms"] == pytest.approx(np.hypot(0.1, 0.02 / np.sqrt(6)), rel=0.02)
+    assert found["p95_of_noobj"] == pytest.approx(found["p95"] / 2)
+    assert found["tiles"] == 400
