@@ -34,6 +34,7 @@ GUARDS = {
     "edge_of_model": d.EDGE_OF_MODEL,
     "unseen_albedo": d.UNSEEN_ALBEDO,
 }
+FEW = 1e-3  # of the touched pixels: fewer whose albedo was not seen are counted and not told
 PREDICTED_PX = 20_000  # pixels whose predicted error is asked for
 REBUILD = "R,G,B = plate * mul + add + obj"
 REBUILD_GROUPS = "mul = 1 - obj.A + sum(mul.g - 1); add = sum(add.g); obj = sum(obj.g)"
@@ -227,10 +228,10 @@ def compute(
         "display": display_transform(picture, *looking),
         "plate_display": display_transform(plate.rgb(), *looking),
     }
-    return Result(outputs, numbers, warnings_of(numbers))
+    return Result(outputs, numbers, warnings_of(numbers, numbers["touched_fraction"] * picture[..., 0].size))
 
 
-def warnings_of(numbers: dict[str, Any]) -> list[str]:
+def warnings_of(numbers: dict[str, Any], touched_px: float) -> list[str]:
     """What of the counters a user has to know, and can do."""
     found = []
     if count := numbers["guard_clipped_plate_px"]:
@@ -245,7 +246,8 @@ def warnings_of(numbers: dict[str, Any]) -> list[str]:
             f"composite: a visible change ends at the border of the modelled local scene on {count} px; enlarge "
             "plane.extent, or add the surface beyond it as a [[proxy]]"
         )
-    if count := numbers["guard_unseen_albedo_px"]:
+    count = numbers["guard_unseen_albedo_px"]
+    if count > FEW * touched_px:
         found.append(f"composite: the light changes on {count} px whose albedo was extrapolated, not seen")
     return found
 
