@@ -73,6 +73,8 @@ def envmap_grid(rgb: np.ndarray) -> np.ndarray:
 
 def environment_emitter(mi: Any, rgb: np.ndarray) -> dict[str, Any]:
     """Mitsuba description of a lat-long radiance map (H, W, 3), ACEScg, as in conventions."""
+    if not (rgb > 0).any():  # a map without light has no density to sample by: 0 / 0
+        return {"type": "constant", "radiance": {"type": "rgb", "value": 0.0}}
     bitmap = mi.Bitmap(np.ascontiguousarray(envmap_grid(np.maximum(rgb, 0.0)), np.float32))
     return {"type": "envmap", "bitmap": bitmap}
 
