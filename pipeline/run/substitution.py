@@ -15,10 +15,10 @@ import numpy as np
 from pipeline.conventions import ACESCG, latlong_directions, latlong_from_direction
 from pipeline.image.metrics import box, scale_of
 from pipeline.image.truth import Truth, load_truth
-from pipeline.light.environment import irradiance
 from pipeline.light.sampling import bilinear, planes
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build, settle
+from pipeline.transport.plate_texture import continued, read_plate, texture_size
 from pipeline.types import Camera, Raster, View
 
 FIGURES = ("object_rel_err", "shadow_change_err", "faint_change_err", "shadow_rel_err")
@@ -50,16 +50,18 @@ def true_environment(values: Values, truth: Truth) -> Raster:
 
 
 def true_albedo(values: Values, truth: Truth, build: Build) -> Raster:
-    """The albedo that the plate camera sees, on the plane's texture: a plate of that radiance, read by reflectance."""
+    """The albedo that the plate camera sees, on the plane's texture: read as the plate is, but divided by no light."""
     if truth.albedo is None:
         raise ManifestError("--with-truth albedo: truth.json names no albedo")
-    light = irradiance(values["environment"].rgb(), values["plane"].normal[None])[0]
-    rgb = np.where(truth.albedo[..., 3:] > 0.5, truth.albedo[..., :3] * light / np.pi, np.nan)
-    plate = Raster({**Raster.split(rgb), "mask": np.zeros(rgb.shape[:2], np.uint32)}, ACESCG)
-    stage = build.graph["reflectance"]
-    inputs = {name: values[artifact.name] for name, artifact in stage.inputs.items()}
+    rgb = np.where(truth.albedo[..., 3:] > 0.5, truth.albedo[..., :3], np.nan)
+    picture = Raster({**Raster.split(rgb), "mask": np.zeros(rgb.shape[:2], np.uint32)}, ACESCG)
     params = build.knobs["reflectance"].model_validate(build.settings.params["reflectance"])
-    return stage.compute(**{**inputs, "photographs": {"plate": plate}}, params=params).outputs["albedo"]
+    shape = texture_size(values["plane"], params.texture_px)  # type: ignore[attr-defined]
+    texture = read_plate(picture, values["camera"], values["views"]["plate"], values["plane"], shape)
+    seen = np.zeros(shape)
+    seen[texture.window] = texture.seen
+    known = np.where(texture.seen > 0.5, texture.seen, 0.0)
+    return Raster({**Raster.split(continued(texture.radiance, known, texture.window, shape)), "seen": seen}, ACESCG)
 
 
 # What can be substituted: the artifact it replaces and how it is made.
