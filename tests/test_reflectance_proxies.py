@@ -8,7 +8,7 @@ from small_plates import CAMERA, VIEW, box, ground, lamp_and_sky, photograph
 from pipeline.light.environment import irradiance, total_energy
 from pipeline.transport.gradient import fit
 from pipeline.transport.patches import Geometry, direct_irradiance, enlarged, form_factors, golden, lights_of, quartered
-from pipeline.types import Proxy, Raster
+from pipeline.types import Occluder, Proxy, Raster
 from stages import knobs, reflectance
 
 LAMP = lamp_and_sky(300.0, (-0.3, 0.7, 0.4))
@@ -41,6 +41,21 @@ def test_form_factors_of_two_squares_with_a_common_edge():
     direct, buried = direct_irradiance(geometry, np.ones((64, 128, 3)), lights_of(np.ones((64, 128, 3))))
     np.testing.assert_allclose(direct[floor, 0].mean() / np.pi, 1 - factors[floor].sum(1).mean(), atol=1e-3)
     assert not buried.any()
+
+
+def test_an_occluder_takes_light_and_gives_none():
+    """The same shadow on the plane as a proxy of that shape; nothing is bounced by it or gathered from it."""
+    lights = lights_of(LAMP)
+    hiding = Occluder(name="cube", vertices_m=CUBE.vertices_m, faces=CUBE.faces)
+    real = Geometry(ground(), [CUBE])
+    solid = Geometry(ground(), [], [hiding])
+    cells = solid.patches.cells
+    shadow, buried = (part[:cells] for part in direct_irradiance(real, LAMP, lights))
+    same, _ = direct_irradiance(solid, LAMP, lights)
+    free = buried == 0  # what lies inside is known of a proxy only
+    np.testing.assert_allclose(same[free], shadow[free], rtol=1e-6)
+    assert shadow[free].min() < 0.5 * shadow.max()
+    assert not form_factors(solid).any()
 
 
 def test_split_lights_keep_power_and_irradiance():

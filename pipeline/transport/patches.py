@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.environment import irradiance, resize_environment
+from pipeline.run.errors import ToolError
 from pipeline.transport.reflectance import linear
 from pipeline.transport.scene import ground_shape, proxy_shape
 from pipeline.transport.variant import use_mitsuba
@@ -79,7 +80,7 @@ class Geometry:
     """The surfaces of the local scene, ready for rays from numpy arrays."""
 
     def __init__(self, plane: Plane, proxies: Sequence[Proxy], occluders: Sequence[Occluder] = ()) -> None:
-        self.mi = use_mitsuba()
+        self.mi = arrays_of_rays("proxies and occluders")
         side = np.linalg.norm(plane.corners_m[[1, 3]] - plane.corners_m[0], axis=1)
         size = side.max() / CELLS
         fine = subdivided(proxies, size)
@@ -138,6 +139,14 @@ class Geometry:
             0.0,
             [],
         )
+
+
+def arrays_of_rays(what: str) -> Any:
+    """The mitsuba module, for code that traces arrays. Raises ToolError where only the scalar variant loads."""
+    mi = use_mitsuba()
+    if mi.variant().startswith("scalar"):
+        raise ToolError(f"reflectance: {what} need LLVM or CUDA, found only {mi.variant()}; run insitu doctor")
+    return mi
 
 
 def batches(count: int) -> list[slice]:
