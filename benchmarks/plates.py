@@ -61,6 +61,7 @@ def inputs(scene: Scene, camera: Camera, mesh: Path) -> dict[str, Any]:
         "albedo": Raster(Raster.split(scene.albedo.astype(np.float32)), "acescg"),
         "surface": Surface(),
         "proxies": [],
+        "local_proxies": [],
         "occluders": [],
         "params": knobs.Render(),
     }
