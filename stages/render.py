@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.camera.lens import ray_grid
-from pipeline.conventions import ACESCG
+from pipeline.camera.lens import project, ray_grid
+from pipeline.conventions import ACESCG, invert_rigid, transform_points
 from pipeline.image.colour import Space, luminance
 from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance
@@ -24,7 +24,8 @@ from pipeline.run import artifacts as A
 from pipeline.run import progress
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
-from pipeline.transport.estimate import Canvas, Effort, Shot, lit, prepare, sampled
+from pipeline.transport.caustics import Film
+from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.region import limits_for
@@ -120,8 +121,9 @@ def compute(
         worlds = build_worlds(plane, albedo.rgb(), light, objects, local_proxies, lamps, surface, occluders)
         return worlds, irradiance(light, plane.normal[None])[0]
 
+    film = film_of(camera, views["plate"].world_from_camera, rays)
     worlds, light = worlds_under(environment.rgb(), emitters, shapes)
-    canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, tell)
+    canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, film, tell)
     if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
@@ -143,6 +145,16 @@ def compute(
     layers, found, said = result
     numbers |= found
     return Result({"layers": layers}, numbers, warnings + said, evidence(params, numbers))
+
+
+def film_of(camera: Camera, world_from_camera: np.ndarray, rays: Rays) -> Film:
+    """Where photons land in the photograph."""
+    camera_from_world = invert_rigid(world_from_camera)
+    return Film(
+        lambda points: project(camera, transform_points(camera_from_world, points)),
+        rays.solid_angles().reshape(camera.height, camera.width),
+        world_from_camera[:3, 3],
+    )
 
 
 def refined(canvas: Canvas) -> Outcome:
@@ -301,6 +313,13 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "modelled": f"{numbers['traced_fraction']:.1%} of the frame traced, the rest of the region interpolated",
             "because": "second differences of the pilot bound the error of interpolation",
             "could_cost": f"{params.threshold / 2:.2%} of the plate, and the pilot's noise",
+        },
+        {
+            "term": "light tracing",
+            "modelled": numbers["light_traced_share"] >= WORTH_TRACING,
+            "because": f"in the pilot {numbers['light_traced_share']:.1%} of the added light was better found from the "
+            f"emitters; worth it from {WORTH_TRACING:.0%}",
+            "could_cost": "noise where mirrors and glass throw the light of lamps",
         },
         {
             "term": "denoiser",

@@ -21,11 +21,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.transport.paths import trace_paths
+import numpy as np
+
+from pipeline.transport.caustics import against_camera
+from pipeline.transport.directions import cone_pdf, cone_share, object_cones, sample_cone
+from pipeline.transport.paths import Caustic, trace_paths
 from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples, camera_hits, collect, make_sampler
-
-CONE_SHARE = 0.5  # of the directions, where the BSDF is sampled too
 
 
 def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
@@ -40,11 +42,12 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     ray, hit, on_object, on_local = camera_hits(worlds, rays, count, sampler.next_2d(), footprint_px)
 
     zero = mi.Color3f(0.0)
-    lost, split, beta, behind = follow(worlds, sampler, hit, on_local, depth)
+    lost, split, beta, behind, density = follow(worlds, sampler, hit, on_local, depth)
     # One path per sample: on from the camera where an object is seen, else along the direction that met an object.
     parted = dr.any(beta != 0)
     onward = mi.Ray3f(dr.select(on_object, ray.o, split.o), dr.select(on_object, ray.d, split.d))
-    found = trace_paths(worlds, worlds.with_objects, sampler, onward, on_object | parted, depth)
+    shared = None if worlds.photons == 0 else caustic(worlds, rays, count, ray, hit, split, density)
+    found = trace_paths(worlds, worlds.with_objects, sampler, onward, on_object | parted, depth, shared)
     gained = dr.select(parted, found * beta, zero)
     if not worlds.convex:
         covered = trace_paths(worlds, worlds.without_objects, sampler, split, behind, depth)
@@ -62,11 +65,29 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     )
 
 
-def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> tuple[Any, Any, Any, Any]:
+def caustic(worlds: Worlds, rays: Rays, count: int, ray: Any, hit: Any, split: Any, density: Any) -> Caustic:
+    """What paths that left the point ``hit`` along ``split``, with ``density``, share with light tracing."""
+    import drjit as dr
+
+    mi = worlds.mi
+    pixel = dr.arange(mi.UInt32, len(rays) * count) // count
+    solid_angle = dr.gather(mi.Float, mi.Float(rays.solid_angles().astype(np.float32)), pixel)
+    pixels_per_area = dr.abs(dr.dot(hit.n, ray.d)) / (dr.square(hit.t) * solid_angle)
+    scale = dr.abs(dr.dot(hit.n, split.d)) / (pixels_per_area * density)
+    active = (density > 0) & (pixels_per_area > 0)
+
+    def against(point: Any, along: Any, light: Any) -> Any:
+        return against_camera(worlds, point, -along.d, light) * scale
+
+    return Caustic(active, against)
+
+
+def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> tuple[Any, ...]:
     """Difference paths from points of the local scene.
 
-    Returns the lost light so far; the ray that met an object and its weight (0 when none did); and, where local
-    surfaces see each other, whether that ray would have met one of them without the objects.
+    Returns the lost light so far; the ray that met an object and its weight (0 when none did); whether, where local
+    surfaces see each other, that ray would have met one of them without the objects; and the density of its direction
+    when it left the very point that the camera sees, else 0.
     """
     import drjit as dr
 
@@ -77,13 +98,19 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         lost, ray, weight, density = step(worlds, sampler, hit, active)
         meets = dr.any(weight != 0) & worlds.with_objects.ray_test(ray, dr.any(weight != 0))
         beta = dr.select(meets, weight, zero)
-        return lost - hidden_light(worlds, hit, ray, beta, density, meets), ray, beta, mi.Bool(False)
+        return (
+            lost - hidden_light(worlds, hit, ray, beta, density, meets),
+            ray,
+            beta,
+            mi.Bool(False),
+            dr.select(meets, density, 0.0),
+        )
 
     def onward(state: tuple[Any, ...]) -> Any:
         return state[0]
 
     def bounce(state: tuple[Any, ...]) -> tuple[Any, ...]:
-        active, point, through, left, lost, split, beta, behind, sampler = state
+        active, point, through, left, lost, split, beta, behind, drawn, sampler = state
         taken, ray, weight, density = step(worlds, sampler, point, active)
         lost += dr.select(active, through * taken, zero)
         weight = dr.select(active, through * weight, zero)
@@ -95,7 +122,8 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         split = dr.select(meets, ray, split)
         beta = dr.select(meets, weight, beta)
         behind |= covered
-        return active & local & (left > 1), following, weight, left - 1, lost, split, beta, behind, sampler
+        drawn = dr.select(meets & (left == depth), density, drawn)
+        return active & local & (left > 1), following, weight, left - 1, lost, split, beta, behind, drawn, sampler
 
     width = dr.width(active)
     state = (
@@ -107,10 +135,11 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         nothing,
         dr.zeros(mi.Color3f, width),
         dr.full(mi.Bool, False, width),
+        dr.zeros(mi.Float, width),
         sampler,
     )
     state = dr.while_loop(state, lambda *s: onward(s), lambda *s: bounce(s), label="difference path")
-    return state[4], state[5], state[6], state[7]
+    return state[4:9]
 
 
 def step(worlds: Worlds, sampler: Any, hit: Any, active: Any) -> tuple[Any, Any, Any, Any]:
@@ -126,7 +155,7 @@ def step(worlds: Worlds, sampler: Any, hit: Any, active: Any) -> tuple[Any, Any,
     normal = dr.mulsign(mi.Vector3f(hit.n), hit.wi.z)
     origin = hit.p + normal * (1e-5 * (1 + dr.max(dr.abs(hit.p))))  # ten times nearer than Mitsuba's own offset
     cones = object_cones(worlds, origin)
-    share = 1.0 if worlds.convex and worlds.diffuse else CONE_SHARE
+    share = cone_share(worlds)
     lost = mi.Color3f(0.0)
     for group in worlds.lights_above:
         light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(active), False, active)
@@ -167,53 +196,3 @@ def hidden_light(worlds: Worlds, hit: Any, ray: Any, weight: Any, density: Any, 
         pdf = emitter.pdf_direction(hit, record, active)  # the only light of that scene
         total += emitter.eval(away, active) * (density / (density + pdf))
     return dr.select(active, weight * total, mi.Color3f(0.0))
-
-
-def object_cones(worlds: Worlds, origin: Any) -> list[tuple[Any, Any, Any]]:
-    """Per object: axis, cosine of the half angle (-1 when the point is inside the sphere), and share of samples.
-
-    Shares follow the cones' solid angles, an upper bound of what each object can change.
-    """
-    import drjit as dr
-
-    mi = worlds.mi
-    cones = []
-    for x, y, z, radius in worlds.bounds:
-        offset = mi.Vector3f(float(x), float(y), float(z)) - origin
-        distance = dr.norm(offset)
-        sine = float(radius) * 1.001 / distance
-        inside = sine >= 0.999
-        cosine = dr.select(inside, -1.0, dr.sqrt(dr.maximum(1 - sine * sine, 0.0)))
-        # A point inside uses the whole hemisphere with the cosine, of weight 1; a cone 1 - cos of one hemisphere.
-        share = dr.select(inside, 1.0, dr.maximum(1 - cosine, 1e-4))
-        cones.append((offset / distance, cosine, share))
-    total = sum((share for _, _, share in cones), mi.Float(0.0))
-    return [(axis, cosine, share / total) for axis, cosine, share in cones]
-
-
-def cone_pdf(cones: list[tuple[Any, Any, Any]], direction: Any, normal: Any) -> Any:
-    """Density [1/sr] with which `sample_cone` chooses a direction."""
-    import drjit as dr
-
-    density = 0.0 * dr.dot(direction, normal)
-    hemisphere = dr.maximum(dr.dot(direction, normal), 0.0) * dr.inv_pi
-    for axis, cosine, share in cones:
-        within = dr.select(dr.dot(direction, axis) >= cosine, 1 / (dr.two_pi * dr.maximum(1 - cosine, 1e-12)), 0.0)
-        density += share * dr.select(cosine == -1, hemisphere, within)
-    return density
-
-
-def sample_cone(mi: Any, cones: list[tuple[Any, Any, Any]], choice: Any, point: Any, normal: Any) -> Any:
-    """A direction towards one of the objects."""
-    import drjit as dr
-
-    hemisphere = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(point))
-    direction = mi.Vector3f(hemisphere)
-    passed = mi.Float(0.0)
-    for axis, cosine, share in cones:
-        here = (choice >= passed) & (choice < passed + share)
-        local = mi.warp.square_to_uniform_cone(point, cosine)
-        aimed = dr.select(cosine == -1, hemisphere, mi.Frame3f(axis).to_world(local))
-        direction = dr.select(here, aimed, direction)
-        passed += share
-    return direction

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.transport.caustics import PHOTONS_PER_SAMPLE, Film, thrown, throws
 from pipeline.transport.denoise import (
     TILE,
     Half,
@@ -34,6 +35,8 @@ STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": 
 PILOT_SHARE = 4  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
+PILOT_PHOTONS = 2  # samples' worth
+WORTH_TRACING = 0.02  # of the added light: less of it in caustics is left to paths from the camera
 JUDGED = (
     "obj", "lost", "gained", "albedo", "alpha", "obj_albedo", "obj_normal", "obj_variance", "change_variance",
 )  # fmt: skip
@@ -63,6 +66,7 @@ class Canvas:
     plate_sigma: np.ndarray  # (H, W) noise of the photograph, radiance; not finite where unknown
     white: float  # radiance of display white
     effort: Effort
+    film: Film | None = None  # where light tracing is worth its cost
 
     @property
     def traced(self) -> np.ndarray:
@@ -94,6 +98,7 @@ def prepare(
     white: float,
     limits: Limits,
     effort: Effort,
+    film: Film | None = None,
     tell: Tell = lambda what: lambda share: None,
 ) -> tuple[Canvas, dict[str, float]]:
     """The pilot, the region, and LS_noobj in it; and what is left out of the region, relative.
@@ -107,20 +112,31 @@ def prepare(
         white: radiance of display white.
         limits: of the region.
         effort: what to spend.
+        film: the photograph's lens, for light tracing; None to leave all light to paths from the camera.
         tell: gives a progress callback for a named task.
     """
     index, grid = cell_pixels(*shape)
     samples = max(64, PILOT_SHARE * effort.samples)
     closed = worlds.convex and worlds.diffuse
+    film = film if effort.strategy == "difference" and throws(worlds) else None
+    if film is not None:
+        worlds = replace(worlds, photons=PHOTONS_PER_SAMPLE * shape[0] * shape[1])
     pilot = trace(
         difference_block, worlds, rays[index], samples, effort.depth, effort.seed + 1, CELL, tell("render: pilot")
     )
+    share = 0.0
+    if film is not None:
+        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.seed + 1))
+        share = float(light_by_cell.sum() / max((pilot.gained + light_by_cell).sum(), 1e-30))
+        pilot = replace(pilot, gained=pilot.gained + light_by_cell)
+        if share < WORTH_TRACING:
+            film, worlds = None, replace(worlds, photons=0.0)
     cell_light = light if closed else received(worlds, rays[index], grid, samples, effort, CELL)
     region, left = plan(pilot, pilot.albedo * cell_light / np.pi, grid, shape, limits)
     if effort.strategy == "reference" or not effort.adaptive:
         region = replace(region, traced=region.weight > 0)
-    canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort)
-    return lit(canvas, worlds, light, tell), left
+    canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort, film)
+    return lit(canvas, worlds, light, tell), left | {"light_traced_share": share}
 
 
 def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda what: lambda share: None) -> Canvas:
@@ -138,7 +154,12 @@ def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda w
         light[inside] = received(
             worlds, canvas.rays[inside], size, effort.samples, effort, 1.0, tell("render: without")
         )
-    return replace(canvas, worlds=worlds, light=light)
+    return replace(canvas, worlds=replace(worlds, photons=canvas.worlds.photons), light=light)
+
+
+def cells_of(picture: np.ndarray) -> np.ndarray:
+    """(cells, 3) means of a picture (H, W, 3) over the region's cells."""
+    return np.stack([tile_means(picture[..., channel]).ravel() for channel in range(3)], -1)
 
 
 def received(
@@ -186,10 +207,14 @@ def sampled(
     def noisy(halves: Halves, ahead: int) -> np.ndarray:
         return still_noisy(canvas, halves, ahead) if effort.adaptive else halves.open
 
-    rays = canvas.rays[canvas.traced]
-    strategy = STRATEGIES[effort.strategy]
+    def light(samples: int, seed: int) -> np.ndarray:
+        assert canvas.film is not None
+        return thrown(canvas.worlds, canvas.film, samples, seed).reshape(-1, 3)[canvas.traced]
+
+    rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.seed + 2
+    strategy, traced_light = STRATEGIES[effort.strategy], light if canvas.film is not None else None
     for halves in refine(
-        strategy, canvas.worlds, rays, effort.samples, effort.depth, effort.seed + 2, noisy, start, progress
+        strategy, worlds, rays, effort.samples, effort.depth, seed, noisy, traced_light, start, progress
     ):
         yield Shot(canvas, halves)
 

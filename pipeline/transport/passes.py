@@ -24,33 +24,52 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """What has been sampled of a set of pixels: two independent halves, the passes made, and what is still open."""
+    """What has been sampled of a set of pixels: two independent halves, the passes made, and what is still open.
 
-    a: Samples
-    b: Samples
+    ``thrown`` is what light tracing adds to the gained light of each half (`pipeline.transport.caustics`): it covers
+    all pixels in every pass, open or not.
+    """
+
+    first: Samples
+    second: Samples
+    thrown: np.ndarray  # (2, N, 3)
     passes: int
     open: np.ndarray  # (N,) bool, pixels that want more samples
 
     @classmethod
     def none(cls, pixels: int) -> Halves:
         """Before the first pass."""
-        return cls(Samples.none(pixels), Samples.none(pixels), 0, np.ones(pixels, bool))
+        return cls(Samples.none(pixels), Samples.none(pixels), np.zeros((2, pixels, 3)), 0, np.ones(pixels, bool))
+
+    @property
+    def a(self) -> Samples:
+        """One half."""
+        return replace(self.first, gained=self.first.gained + self.thrown[0])
+
+    @property
+    def b(self) -> Samples:
+        """The other."""
+        return replace(self.second, gained=self.second.gained + self.thrown[1])
 
     @property
     def both(self) -> Samples:
         """All samples."""
-        return self.a + self.b
+        both = self.first + self.second
+        return replace(both, gained=both.gained + self.thrown.mean(0))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        halves = {f"{half}_{f.name}": getattr(getattr(self, half), f.name) for half in "ab" for f in fields(Samples)}
-        return halves | {"passes": np.array(self.passes), "open": self.open}
+        parts = {"first": self.first, "second": self.second}
+        samples = {f"{half}_{f.name}": getattr(part, f.name) for half, part in parts.items() for f in fields(Samples)}
+        return samples | {"thrown": self.thrown, "passes": np.array(self.passes), "open": self.open}
 
     @classmethod
     def of_arrays(cls, arrays: dict[str, np.ndarray]) -> Halves:
         """From a checkpoint."""
-        a, b = (Samples(**{f.name: arrays[f"{half}_{f.name}"] for f in fields(Samples)}) for half in "ab")
-        return cls(a, b, int(arrays["passes"]), arrays["open"])
+        first, second = (
+            Samples(**{f.name: arrays[f"{half}_{f.name}"] for f in fields(Samples)}) for half in ("first", "second")
+        )
+        return cls(first, second, arrays["thrown"], int(arrays["passes"]), arrays["open"])
 
 
 def schedule(samples: int) -> tuple[list[int], int]:
@@ -75,6 +94,7 @@ def refine(
     depth: int,
     seed: int,
     noisy: Callable[[Halves, int], np.ndarray],
+    thrown: Callable[[int, int], np.ndarray] | None = None,
     start: Halves | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Halves]:
@@ -89,6 +109,7 @@ def refine(
         samples: most samples per pixel; pixels that show an object may take `OBJECT_BOOST` times as many.
         noisy: (N,) bool, the pixels whose noise still matters, asked between passes with the number of samples still to
             come if none leaves, of one half.
+        thrown: light tracing for as many samples of a pixel, with a seed: (N, 3) to add to the gained light.
         start: where an earlier run stopped. The result is the same to the byte as without stopping.
         progress: told the share of samples done; may raise `Interrupted`.
     """
@@ -99,21 +120,20 @@ def refine(
         index = np.flatnonzero(halves.open)
         if not len(index):
             return
-        ahead = _ahead(halves.open, (halves.a.alpha + halves.b.alpha) > 0, steps, plain, number) or 1
-        tells = [_part(progress, spent, len(index) * steps[number], ahead, half) for half in range(2)]
-        a, b = (
-            part.placed(
-                index,
-                trace(
-                    strategy, worlds, rays[index], steps[number], depth, seed + 2 * number + half, progress=tells[half]
-                ),
-            )
-            for half, part in enumerate((halves.a, halves.b))
-        )
-        spent += len(index) * steps[number]
-        on_object = (a.alpha + b.alpha) > 0
+        step, on_object = steps[number], (halves.first.alpha + halves.second.alpha) > 0
+        ahead = _ahead(halves.open, on_object, steps, plain, number) or 1
+        parts, light = [], halves.thrown.copy()
+        for half, part in enumerate((halves.first, halves.second)):
+            tell = _part(progress, spent, len(index) * step, ahead, half)
+            more = trace(strategy, worlds, rays[index], step, depth, seed + 2 * number + half, progress=tell)
+            parts.append(part.placed(index, more))
+            if thrown is not None:
+                share = step / sum(steps[: number + 1])
+                light[half] += share * (thrown(step, seed + 2 * number + half) - light[half])
+        spent += len(index) * step
+        on_object = (parts[0].alpha + parts[1].alpha) > 0
         left = np.full(len(rays), number + 1 < plain) | (on_object & (number + 1 < len(steps)))
-        halves = Halves(a, b, number + 1, halves.open & left)
+        halves = Halves(parts[0], parts[1], light, number + 1, halves.open & left)
         ahead = _ahead(halves.open, on_object, steps, plain, number + 1)
         if ahead:
             halves = replace(halves, open=halves.open & noisy(halves, ahead))

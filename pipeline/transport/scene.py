@@ -49,6 +49,7 @@ class Worlds:
     bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
     convex: bool = True
     diffuse: bool = True
+    photons: float = 0.0  # for every sample of a pixel and every emitter: what camera paths leave to light tracing
     occluders: Any = None  # scene of real things that hide the objects from the camera; they take no part in the light
 
     def is_local(self, hit: Any) -> Any:

@@ -47,6 +47,11 @@ class Rays:
     def __len__(self) -> int:
         return len(self.centre)
 
+    def solid_angles(self) -> np.ndarray:
+        """(N,) of the pixels [sr]."""
+        area = np.abs((np.cross(self.by_x, self.by_y) * self.centre).sum(1))
+        return area / np.linalg.norm(self.centre, axis=1) ** 3
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:

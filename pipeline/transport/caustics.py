@@ -1,0 +1,194 @@
+"""Light tracing: what an emitter throws by way of the objects straight onto the local scene.
+
+A path from the camera finds the mirror image of the sun in an object by chance only; a path from the sun finds it
+always. So paths emitter - object(s) - local scene - camera are also built from the light: directions and points of the
+emitter's light on discs around the objects, on along the BSDFs, and where a local surface is met that the camera sees,
+into its pixel. Two kinds of such paths come from here:
+
+* off one object: shared with the paths from the camera by multiple importance sampling (balance heuristic), whatever
+  the material, so that each finds what it is good at;
+* along mirrors and glass of any number: from here alone, since camera paths cannot (a small light, a delta BSDF).
+
+Light of the sky, and what bounces more than once off rough objects, stays with the camera's paths.
+Arvo, *Backward ray tracing*, 1986; Veach, *Robust Monte Carlo methods for light transport simulation*, 1997, ch. 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.transport.directions import direction_density
+from pipeline.transport.scene import LightGroup, Worlds
+
+MIRRORS = 12  # longest chain of mirrors and glass surfaces
+PHOTONS_PER_SAMPLE = 0.1  # photons for every pixel of the photograph and every sample that a pixel gets
+PHOTONS_PER_BLOCK = 1 << 21
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Where photons land: through the photograph's own lens.
+
+    ``project``: world points (N, 3) to pixels (N, 2), NaN where the lens does not see them. ``pixel_sr``: (H, W) solid
+    angle of each pixel. ``origin``: (3,) the camera.
+    """
+
+    project: Callable[[np.ndarray], np.ndarray]
+    pixel_sr: np.ndarray
+    origin: np.ndarray
+
+
+def throws(worlds: Worlds) -> bool:
+    """Whether there is an emitter, and an object that could throw its light."""
+    return any(group.compact for group in worlds.lights) and len(worlds.bounds) > 0
+
+
+def disc_density(worlds: Worlds, point: Any, direction: Any) -> Any:
+    """Density [1/m^2] of photons, per photon, on the line through ``point`` against ``direction``.
+
+    They start on discs across the objects' bounding spheres, on one as often as on another.
+    """
+    import drjit as dr
+
+    mi = worlds.mi
+    density = 0.0 * direction.x
+    for x, y, z, radius in worlds.bounds:
+        offset = point - mi.Point3f(float(x), float(y), float(z))
+        aside = dr.squared_norm(offset - direction * dr.dot(offset, direction))
+        share = 1 / (np.pi * float(radius) ** 2 * len(worlds.bounds))
+        density += dr.select(aside <= float(radius) ** 2, share, 0.0)
+    return density
+
+
+def against_camera(worlds: Worlds, hit: Any, back: Any, light: Any) -> Any:
+    """Off one object: density of light tracing over that of a path from the camera, but for what `lens_term` holds.
+
+    At a point ``hit`` of an object that light from the unit direction ``light`` reaches and leaves along ``back``.
+    """
+    import drjit as dr
+
+    mi = worlds.mi
+    lit = mi.SurfaceInteraction3f(hit)
+    lit.wi = hit.to_local(light)
+    pdf = hit.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), lit, hit.to_local(back))
+    arriving, leaving = dr.abs(dr.dot(hit.n, light)), dr.abs(dr.dot(hit.n, back))
+    ratio = worlds.photons * disc_density(worlds, hit.p, light) * arriving * pdf / leaving
+    return dr.select(leaving > 0, ratio, 0.0)
+
+
+def thrown(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
+    """(H, W, 3) radiance of the local scene by light that emitters send to it by way of the objects.
+
+    Takes ``worlds.photons`` photons for each of ``samples`` samples of a pixel, for each emitter. Add it to what paths
+    from the camera find with the same ``worlds.photons``; together they are unbiased.
+    """
+    height, width = film.pixel_sr.shape
+    picture = np.zeros((height * width, 3))
+    lamps = [group for group in worlds.lights if group.compact]
+    wanted = max(1, round(worlds.photons * samples))
+    for number, lamp in enumerate(lamps):
+        for start in range(0, wanted, PHOTONS_PER_BLOCK):
+            count = min(PHOTONS_PER_BLOCK, wanted - start)
+            landed = _landed(worlds, film, lamp, count, seed + 104729 * (number + 1) + start)
+            pixel = film.project(landed["point"])
+            with np.errstate(invalid="ignore"):
+                column, row = np.floor(pixel).T
+                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index = (row[inside] * width + column[inside]).astype(int)
+            per_area = landed["per_area"][inside] / film.pixel_sr.ravel()[index]  # pixels per m^2 of the surface
+            ratio = landed["ratio"][inside] / per_area
+            share = np.where(np.isinf(ratio), 1.0, ratio / (1 + np.where(np.isinf(ratio), 0, ratio)))
+            value = landed["value"][inside] * (share * per_area / wanted)[:, None]
+            for channel in range(3):
+                picture[:, channel] += np.bincount(index, value[:, channel], height * width)
+    return picture.reshape(height, width, 3)
+
+
+def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int) -> dict[str, np.ndarray]:
+    """Photons that reached a local surface which the camera sees.
+
+    ``point`` (N, 3); ``value`` (N, 3) BSDF towards the camera times flux; ``per_area`` (N,) cosine over squared
+    distance to the camera, [sr / m^2]; ``ratio`` (N,) density against paths from the camera but for pixels per area,
+    infinite where no such path competes.
+    """
+    import drjit as dr
+
+    mi = worlds.mi
+    scene = worlds.with_objects
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed % 2**32, count)
+    anywhere = dr.zeros(mi.SurfaceInteraction3f, count)
+    light, weight = lamp.scene.sample_emitter_direction(anywhere, sampler.next_2d(), False)
+    choice = dr.minimum(mi.UInt32(sampler.next_1d() * len(worlds.bounds)), len(worlds.bounds) - 1)
+    columns = [dr.gather(mi.Float, mi.Float(np.ascontiguousarray(c, np.float32)), choice) for c in worlds.bounds.T]
+    disc = mi.warp.square_to_uniform_disk(sampler.next_2d()) * columns[3]
+    centre = mi.Point3f(*columns[:3])
+    start = centre + mi.Frame3f(light.d).to_world(mi.Vector3f(disc.x, disc.y, 0.0))
+    far = float(np.abs(worlds.plane.corners_m).max() + np.abs(worlds.bounds).sum(1).max()) * 4
+    flux = dr.select(light.pdf > 0, weight / disc_density(worlds, start, light.d), mi.Color3f(0.0))
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+
+    def body(*state: Any) -> tuple[Any, ...]:
+        active, ray, flux, ratio, left, landed, found, sampler = state
+        hit = scene.ray_intersect(ray, active=active)
+        local = worlds.is_local(hit)
+        arrives = active & local & (left < MIRRORS)
+        found = dr.select(arrives, hit, found)
+        landed |= arrives
+        # On an object: after a rough one the path ends at the next surface, whatever that is.
+        onward = active & hit.is_valid() & ~local & dr.isinf(ratio) & (left > 0)
+        drawn, weight = hit.bsdf().sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
+        outward = hit.to_world(drawn.wo)
+        # Shading normals make a BSDF asymmetric (Veach, section 5.3).
+        coming, going = dr.dot(hit.n, -ray.d), dr.dot(hit.n, outward)
+        cos_in, cos_out = mi.Frame3f.cos_theta(hit.wi), mi.Frame3f.cos_theta(drawn.wo)
+        onward &= (coming * cos_in > 0) & (going * cos_out > 0)
+        weight *= dr.abs(cos_in * going / (cos_out * coming))
+        flux = dr.select(onward, flux * weight, flux)
+        delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
+        rough = onward & ~delta
+        onward &= dr.any(flux != 0) & (delta | (left == MIRRORS))  # rough only as the first and only one
+        off_one = against_camera(worlds, hit, outward, -ray.d)
+        ratio = dr.select(rough, off_one, ratio)
+        return onward, dr.select(onward, hit.spawn_ray(outward), ray), flux, ratio, left - 1, landed, found, sampler
+
+    infinite = dr.full(mi.Float, float("inf"), count)
+    ray = mi.Ray3f(start + light.d * far, -light.d)
+    state = (
+        dr.any(flux != 0),
+        ray,
+        flux,
+        infinite,
+        dr.full(mi.Int32, MIRRORS, count),
+        dr.full(mi.Bool, False, count),
+        dr.zeros(mi.SurfaceInteraction3f, count),
+        sampler,
+    )
+    _, ray, flux, ratio, _, landed, found, _ = dr.while_loop(state, lambda *s: s[0], body, label="photons")
+    back = found.to_world(found.wi)  # where the photon came from
+    offset = mi.Point3f(*[float(v) for v in film.origin]) - found.p
+    distance = dr.norm(offset)
+    toward = offset / distance
+    landed &= (dr.dot(found.n, toward) * dr.dot(found.n, back)) > 0
+    sight = found.spawn_ray_to(mi.Point3f(*[float(v) for v in film.origin]))
+    landed &= ~scene.ray_test(sight, landed)
+    if worlds.occluders is not None:
+        landed &= ~worlds.occluders.ray_test(sight, landed)
+    seen = mi.SurfaceInteraction3f(found)
+    seen.wi = found.to_local(toward)
+    value, pdf = found.bsdf().eval_pdf(mi.BSDFContext(), seen, found.wi, landed)
+    cosine = dr.abs(dr.dot(found.n, back))
+    normal = dr.mulsign(mi.Vector3f(found.n), dr.dot(found.n, toward))
+    density = direction_density(worlds, found.p, normal, back, pdf)
+    value *= flux / cosine
+    ratio = dr.select(density > 0, ratio * cosine / density, float("inf"))
+    per_area = dr.abs(dr.dot(found.n, toward)) / dr.square(distance)
+    keep = landed & dr.all(dr.isfinite(value))
+    index = mi.UInt32(dr.compress(keep))
+    numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio)]
+    rows = np.stack([np.asarray(dr.gather(mi.Float, number, index)) for number in numbers]).astype(float)
+    return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7]}
