@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from small_plates import CAMERA, VIEW, ground, lamp_and_sky, photograph, texture
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
+from pipeline.light.environment import irradiance
 from pipeline.transport import specular
 from pipeline.transport.patches import lights_of
 from pipeline.types import Raster
@@ -37,6 +39,25 @@ def test_a_textured_matte_plane_stays_diffuse(seed):
     assert base_error(result, truth) < 0.015
     rough = result.outputs["surface"].scores[1]
     assert rough["gain"] < 0
+
+
+@pytest.mark.parametrize("lamp", [400.0, 0.0])
+@pytest.mark.parametrize("kind", ["blobs", "patchwork"])
+def test_coarse_patterns_are_not_taken_for_gloss(kind, lamp):
+    """Patterns as coarse as a lobe, under a lamp and under a bare sky; noise 0.3 %."""
+    environment = lamp_and_sky(lamp, (0.05, 0.62, -0.75))
+    rng = np.random.default_rng(5)
+    size = (CAMERA.height, CAMERA.width)
+    for _ in range(2):
+        blobs = gaussian_filter(rng.normal(size=size), 25)
+        albedo = np.array([0.4, 0.35, 0.3]) * np.exp(0.3 * blobs / blobs.std())[..., None]
+        if kind == "patchwork":
+            albedo = rng.uniform(0.1, 0.8, (6, 8, 3)).repeat(20, 0).repeat(20, 1)
+        radiance = albedo * irradiance(environment, np.array([[0.0, 1, 0]]))[0] / np.pi
+        noisy = radiance * (1 + 0.003 * rng.normal(size=radiance.shape))
+        variance = Raster.split((0.003 * radiance) ** 2, "variance")
+        plate = Raster({**Raster.split(noisy), **variance, "mask": np.zeros(size, np.uint32)}, "acescg")
+        assert solve(plate, environment).outputs["surface"].model == "diffuse"
 
 
 @pytest.mark.parametrize(("roughness", "f0"), [(0.3, 0.04), (0.5, 0.06)])
