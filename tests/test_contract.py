@@ -37,9 +37,12 @@ BRIDGES = {
     },
     "mitsuba": {"pipeline/transport/variant.py"},
     "drjit": {
+        "pipeline/transport/caustics.py",
         "pipeline/transport/difference.py",
+        "pipeline/transport/directions.py",
         "pipeline/transport/gradient.py",
         "pipeline/transport/materials.py",
+        "pipeline/transport/paths.py",
         "pipeline/transport/trace.py",
         "pipeline/simulation/photograph.py",
         "pipeline/simulation/twin_world.py",

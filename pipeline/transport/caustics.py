@@ -25,7 +25,7 @@ from pipeline.transport.directions import direction_density
 from pipeline.transport.scene import LightGroup, Worlds
 
 MIRRORS = 12  # longest chain of mirrors and glass surfaces
-PHOTONS_PER_SAMPLE = 0.1  # photons for every pixel of the photograph and every sample that a pixel gets
+PHOTONS_PER_SAMPLE = 0.04  # photons for every pixel of the photograph and every sample that a pixel gets
 PHOTONS_PER_BLOCK = 1 << 21
 
 
