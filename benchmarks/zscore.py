@@ -186,7 +186,7 @@ def judged(fast: Tally, reference: Tally, noobj: np.ndarray) -> dict[str, Any]:
 
 
 def run(
-    scenes: int = 20, scene_cpu_s: float = 15.0, bias_scenes: int = 5, tell: Callable[[str], None] = lambda text: None
+    scenes: int = 20, scene_cpu_s: float = 15.0, bias_scenes: int = 4, tell: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
     """All scenes, and the deliberate biases on the first few. ``zscore_max`` must stay below 5."""
     table = []
