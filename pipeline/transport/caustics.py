@@ -47,6 +47,11 @@ def throws(worlds: Worlds) -> bool:
     return any(group.compact for group in worlds.lights) and len(worlds.bounds) > 0
 
 
+def photons_for(worlds: Worlds, pixels: int) -> float:
+    """Photons for every sample of a pixel and every emitter, of a photograph of so many pixels."""
+    return PHOTONS_PER_SAMPLE * pixels / max(1, sum(group.compact for group in worlds.lights))
+
+
 def disc_density(worlds: Worlds, point: Any, direction: Any) -> Any:
     """Density [1/m^2] of photons, per photon, on the line through ``point`` against ``direction``.
 

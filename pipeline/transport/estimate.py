@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.transport.caustics import PHOTONS_PER_SAMPLE, Film, thrown, throws
+from pipeline.transport.caustics import Film, photons_for, thrown, throws
 from pipeline.transport.denoise import (
     TILE,
     Half,
@@ -120,7 +120,7 @@ def prepare(
     closed = worlds.convex and worlds.diffuse
     film = film if effort.strategy == "difference" and throws(worlds) else None
     if film is not None:
-        worlds = replace(worlds, photons=PHOTONS_PER_SAMPLE * shape[0] * shape[1])
+        worlds = replace(worlds, photons=photons_for(worlds, shape[0] * shape[1]))
     pilot = trace(
         difference_block, worlds, rays[index], samples, effort.depth, effort.seed + 1, CELL, tell("render: pilot")
     )

@@ -26,8 +26,8 @@ class Interrupted(Exception):
 class Halves:
     """What has been sampled of a set of pixels: two independent halves, the passes made, and what is still open.
 
-    ``thrown`` is what light tracing adds to the gained light of each half (`pipeline.transport.caustics`): it covers
-    all pixels in every pass, open or not.
+    ``thrown`` is what light tracing adds to the gained light of each half (`pipeline.transport.caustics`): in the passes
+    that pixels without an object take, for all pixels, open or not.
     """
 
     first: Samples
@@ -127,7 +127,7 @@ def refine(
             tell = _part(progress, spent, len(index) * step, ahead, half)
             more = trace(strategy, worlds, rays[index], step, depth, seed + 2 * number + half, progress=tell)
             parts.append(part.placed(index, more))
-            if thrown is not None:
+            if thrown is not None and number < plain:
                 share = step / sum(steps[: number + 1])
                 light[half] += share * (thrown(step, seed + 2 * number + half) - light[half])
         spent += len(index) * step
