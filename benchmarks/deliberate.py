@@ -124,10 +124,12 @@ def cut(canvas: Canvas, truth: np.ndarray, noobj: np.ndarray) -> np.ndarray:
 
 
 def figures(parts: list[Told]) -> dict[str, float]:
-    """Of one effect in several scenes."""
+    """Of one effect in several scenes; without a tile where it counts, only that."""
     effects = np.concatenate([part.effect for part in parts], 1)
     size = np.abs(np.concatenate([part.true for part in parts]))
     noobj = np.concatenate([part.noobj for part in parts])
+    if not len(size):
+        return {"tiles": 0}
     mean = effects.mean(0)
     noise = effects.std(0, ddof=1) / np.sqrt(SEEDS) / size
     return {

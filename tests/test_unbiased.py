@@ -105,3 +105,4 @@ def test_figures_of_a_deliberate_bias():
     assert found["rms"] == pytest.approx(np.hypot(0.1, 0.02 / np.sqrt(6)), rel=0.02)
     assert found["p95_of_noobj"] == pytest.approx(found["p95"] / 2)
     assert found["tiles"] == 400
+    assert figures([Told(effect[:, :0], true[:0], true[:0])]) == {"tiles": 0}
