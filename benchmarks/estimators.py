@@ -18,6 +18,7 @@ from pipeline.camera.lens import ray_grid
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance
+from pipeline.transport.caustics import Film, photons_for, thrown
 from pipeline.transport.denoise import denoise
 from pipeline.transport.difference import difference_block
 from pipeline.transport.estimate import Effort, Shot, prepare, sampled
@@ -39,11 +40,11 @@ from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Emitter, Proxy, Raster
 from stages import composite
 from stages.knobs import Render
-from stages.render import to_layers
+from stages.render import film_of, to_layers
 
 LOOK = 8  # samples of the first look of a reference
 QUIET = 0.004  # relative noise of that look below which a pixel gets the smaller count
-SHADOW = 0.2  # of the light taken away: a deep shadow
+PHOTON_SAMPLES = 1024  # of a reference with glass and mirrors, as `thrown` counts them
 REFERENCE_DEPTH = 12
 PLATE_NOISE = 0.01  # of the radiance: what region and passes take the photograph's noise to be
 
@@ -54,11 +55,13 @@ class Loaded:
 
     scene: Scene
     worlds: Worlds
+    film: Film
     rays: Rays  # of every pixel, or of some
+    pixels: np.ndarray  # their flat index
 
-    def at(self, pixels: np.ndarray) -> Loaded:
-        """The same for some of the pixels, by their flat index."""
-        return replace(self, rays=self.rays[pixels])
+    def at(self, index: np.ndarray) -> Loaded:
+        """The same for some of the pixels."""
+        return replace(self, rays=self.rays[index], pixels=self.pixels[index])
 
 
 def surface(mi: Any, item: Item) -> dict[str, Any]:
@@ -89,7 +92,8 @@ def load(scene: Scene) -> Loaded:
     worlds = build_worlds(scene.plane, scene.albedo, scene.environment, shapes, proxies, [sun_of(scene)])
     xn, dxn = ray_grid(scene.camera)
     rays = Rays.of(scene.world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
-    return Loaded(scene, worlds, rays)
+    film = film_of(scene.camera, scene.world_from_camera, rays)
+    return Loaded(scene, worlds, film, rays, np.arange(len(rays)))
 
 
 def sun_of(scene: Scene) -> Emitter:
@@ -120,24 +124,25 @@ def ours(stage: Loaded, plate: np.ndarray, samples: int, depth: int, seed: int) 
     return additive(plate, trace(difference_block, stage.worlds, stage.rays, samples, depth, seed))
 
 
-def reference(stage: Loaded, plate: np.ndarray, samples: tuple[int, int, int], seed: int) -> np.ndarray:
-    """The truth with little noise: `ours`, deeper, with more samples where a first look finds noise or a deep shadow.
+def reference(stage: Loaded, plate: np.ndarray, samples: tuple[int, int], seed: int) -> np.ndarray:
+    """The truth with little noise: `ours`, deeper, with more samples where a first look finds noise.
 
-    The third number is for shadows of scenes with glass and mirrors: where a lens gathers the sun, one path in
-    thousands carries all the light, and an error in display values would miss what a short reference misses too. There
-    no pixel counts as quiet either. The look is thrown away: choosing by the samples that are kept would bias them.
+    In scenes of glass and mirrors no pixel counts as quiet, and the sun is traced from its own side too: where a lens
+    gathers it, one path in thousands from the camera carries all the light, and an error in display values would miss
+    what the reference misses. The look is thrown away: choosing by the samples that are kept would bias them.
     """
+    specular = any(item.kind in ("glass", "mirror") for item in stage.scene.items)
     look = trace(difference_block, stage.worlds, stage.rays, LOOK, REFERENCE_DEPTH, seed)
     level = np.maximum(additive(plate, look), 1e-9)
-    specular = any(item.kind in ("glass", "mirror") for item in stage.scene.items)
     noisy = (np.sqrt(look.obj_variance + look.change_variance) > QUIET * level).any(1) | specular
-    deep = specular & (look.lost < -SHADOW * level).any(1) & (look.alpha < 1)
-    picture = np.empty_like(plate)
-    for count, where in zip(samples, (~noisy & ~deep, noisy & ~deep, deep), strict=True):
-        index = np.flatnonzero(where)
+    worlds, picture = stage.worlds, np.zeros_like(plate)
+    if specular:
+        worlds = replace(worlds, photons=photons_for(worlds, stage.film.pixel_sr.size))
+        picture += thrown(worlds, stage.film, PHOTON_SAMPLES, seed + 2).reshape(-1, 3)[stage.pixels]
+    for count, index in zip(samples, (np.flatnonzero(~noisy), np.flatnonzero(noisy)), strict=True):
         if len(index):
-            part = trace(difference_block, stage.worlds, stage.rays[index], count, REFERENCE_DEPTH, seed + 1)
-            picture[index] = additive(plate[index], part)
+            part = trace(difference_block, worlds, stage.rays[index], count, REFERENCE_DEPTH, seed + 1)
+            picture[index] += additive(plate[index], part)
     return picture
 
 
@@ -247,7 +252,7 @@ def insitu(stage: Loaded, plate: np.ndarray, knobs: Render, seed: int, every: bo
         sigma = np.sqrt(variance.mean(-1))
         limits = limits_for(picture, variance, knobs.threshold)
         white = 2.0 ** -display_exposure(picture)
-        canvas, _ = prepare(stage.worlds, stage.rays, (height, width), light, sigma, white, limits, effort)
+        canvas, _ = prepare(stage.worlds, stage.rays, (height, width), light, sigma, white, limits, effort, stage.film)
         passes = sampled(canvas)
     spent, number, latest = begun.seconds, 0, None
     while True:

@@ -22,7 +22,8 @@ loading the scene and compiling kernels; it moves by a quarter with what else th
 strategies take turns and medians are given. Error is the mean squared error over all pixels and channels in code values
 (0 to 255, not rounded) of the sRGB curve after an exposure that puts the median of the plate's green channel at 0.18.
 The truth is two independent renders A and B of the difference strategy, 12 vertices deep: `mean (X - A)(X - B)` is the
-error of X without the noise of either. Whatever a strategy leaves out (deeper paths, the region's outside, what a
+error of X without the noise of either; in `glass_mirror` the sun is traced from its own side too, else the references
+would lack the caustics. Whatever a strategy leaves out (deeper paths, the region's outside, what a
 denoiser smears) counts as error. The plate is LS_noobj itself (closed form; in `corner` a long render), the same for
 all, so that the error is the render's alone. The error is taken on every third pixel in both directions. There alone
 the two strategies that treat all pixels alike are traced, their cost counted ninefold; all others render the whole.
@@ -30,8 +31,10 @@ the two strategies that treat all pixels alike are traced, their cost counted ni
 - **two renders**: path tracing of LS_obj and LS_noobj, {naive_depth} vertices, no Russian roulette, multijittered
   samples, random numbers of their own; composite `plate + LS_obj - LS_noobj` beside the objects. The same kernels as
   insitu's reference strategy.
-- **difference, every pixel**: insitu's estimator alone, unbiased: no region, no denoiser, {naive_depth} vertices.
-- **region**: the same with region, interpolation and passes as the render stage makes them, not denoised.
+- **difference, every pixel**: insitu's estimator alone, unbiased: no region, no denoiser, {naive_depth} vertices, no
+  light tracing.
+- **region**: the same with region, interpolation, light tracing and passes as the render stage makes them, not
+  denoised.
 - **insitu**: that, denoised: what the render stage delivers with the knobs of preview, after each pass. The
   photograph's noise is taken to be 1 % of the radiance.
 - **Cycles** (Blender {version}): shadow catcher, 8 bounces, box filter, no clamp, no adaptive sampling. Its error is
