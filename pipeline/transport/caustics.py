@@ -193,7 +193,8 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     ratio = dr.select(density > 0, ratio * cosine / density, float("inf"))
     per_area = dr.abs(dr.dot(found.n, toward)) / dr.square(distance)
     keep = landed & dr.all(dr.isfinite(value))
-    index = mi.UInt32(dr.compress(keep))
     numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio)]
+    dr.eval(keep, numbers)  # once, else every gather below would run the whole kernel again
+    index = mi.UInt32(dr.compress(keep))
     rows = np.stack([np.asarray(dr.gather(mi.Float, number, index)) for number in numbers]).astype(float)
     return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7]}
