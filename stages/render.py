@@ -36,6 +36,7 @@ from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
+WORTH_A_RAY = 0.15  # of the irradiance: a weaker light is sampled with the sky, by its brightness
 Outcome = tuple[Raster, dict[str, Any], list[str]]  # layers, numbers, warnings
 
 
@@ -122,14 +123,15 @@ def compute(
         return worlds, irradiance(light, plane.normal[None])[0]
 
     film = film_of(camera, views["plate"].world_from_camera, rays)
-    worlds, light = worlds_under(environment.rgb(), emitters, shapes)
+    apart = strong(emitters, plane, irradiance(environment.rgb(), plane.normal[None])[0])
+    worlds, light = worlds_under(environment.rgb(), apart, shapes)
     canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, film, tell)
     if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
         "threshold": limits.threshold,
         "step_over_hidden_step": left["left_out_max"] / limits.hidden,
-        "lights": len(emitters) + 1,
+        "lights": len(apart) + 1,
         "variant": use_mitsuba().variant(),
     }
     if params.light_groups:
@@ -145,6 +147,12 @@ def compute(
     layers, found, said = result
     numbers |= found
     return Result({"layers": layers}, numbers, warnings + said, evidence(params, numbers))
+
+
+def strong(emitters: list[Emitter], plane: Plane, light: np.ndarray) -> list[Emitter]:
+    """The emitters that give enough of the plane's irradiance ``light`` (3,) to be worth a ray of their own."""
+    given = [float((e.irradiance * max(e.direction @ plane.normal, 0.0)).sum()) for e in emitters]
+    return [e for e, part in zip(emitters, given, strict=True) if part >= WORTH_A_RAY * light.sum()]
 
 
 def film_of(camera: Camera, world_from_camera: np.ndarray, rays: Rays) -> Film:

@@ -26,8 +26,8 @@ class Interrupted(Exception):
 class Halves:
     """What has been sampled of a set of pixels: two independent halves, the passes made, and what is still open.
 
-    ``thrown`` is what light tracing adds to the gained light of each half (`pipeline.transport.caustics`): in the passes
-    that pixels without an object take, for all pixels, open or not.
+    ``thrown`` is what light tracing adds to the gained light of each half (`pipeline.transport.caustics`): in the
+    passes that pixels without an object take, for all pixels, open or not.
     """
 
     first: Samples

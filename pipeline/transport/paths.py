@@ -1,17 +1,19 @@
 """Radiance along rays: a path tracer that samples every light on its own.
 
-At each vertex every light group (sky, sun, lamps) and every light-giving object gets a sample of its own, combined with
-the BSDF's by multiple importance sampling (balance heuristic, Veach and Guibas 1995). Mitsuba's own ``path`` picks one
-light per vertex, which is the larger part of its noise under a sun and a sky.
+At the first vertex every light group (sky, sun, lamps) gets a sample of its own, later ones share one over the whole
+map; every light-giving object gets one too. All are combined with the BSDF's by multiple importance sampling (balance
+heuristic, Veach and Guibas 1995). Mitsuba's own ``path`` picks one light per vertex, which is the larger part of its
+noise under a sun and a sky.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.transport.scene import Worlds
+from pipeline.transport.scene import LightGroup, Worlds
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +51,14 @@ def trace_paths(
     aimed = [lamp for lamp in lamps if mi.traverse(lamp)["sampling_weight"] > 0]
     width = dr.width(active)
 
-    def body(*state: Any) -> tuple[Any, ...]:
+    def vertex(lights: Sequence[LightGroup], *state: Any) -> tuple[Any, ...]:
         active, ray, through, found, length, density, delta, mirrors, sampler = state
         hit = scene.ray_intersect(ray, active=active)
         escaped = active & ~hit.is_valid()
         left = mirrors | (caustic.active & (length == 1)) if caustic is not None else mi.Bool(False)
-        found += dr.select(escaped, through * _distant(worlds, ray.d, escaped, density, delta, left), 0.0)
+        apart = (length <= 1) | mirrors
+        for groups, here in ((worlds.lights, escaped & apart), ((worlds.whole,), escaped & ~apart)):
+            found += dr.select(here, through * _distant(worlds, groups, ray.d, here, density, delta, left), 0.0)
         given = active & hit.is_valid()
         for lamp in lamps:
             alone = delta if lamp in aimed else mi.Bool(True)
@@ -62,14 +66,14 @@ def trace_paths(
         onward = given & (length + 1 < depth)
         bsdf = hit.bsdf()
         smooth = onward & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        for group in worlds.lights:
+        for group in lights:
             light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(smooth), False, smooth)
             lit = smooth & (light.pdf > 0)
             lit &= ~scene.ray_test(hit.spawn_ray(light.d), lit)
             value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(light.d), lit)
             weight = light.pdf / (light.pdf + pdf)
             if caustic is not None and group.compact:
-                shared = lit & caustic.active & (length == 0)
+                shared = lit & caustic.active
                 weight = dr.select(shared, 1 / (1 + caustic.against(hit, ray, light.d)), weight)
             found += dr.select(lit, through * value * radiance * weight, 0.0)
         for lamp in aimed:
@@ -97,16 +101,19 @@ def trace_paths(
         mi.Bool(caustic.active) if caustic is not None else dr.full(mi.Bool, False, width),
         sampler,
     )
-    return dr.while_loop(state, lambda *s: s[0], body, label="path")[3]
+    state = vertex(worlds.lights, *state)
+    return dr.while_loop(state, lambda *s: s[0], functools.partial(vertex, (worlds.whole,)), label="path")[3]
 
 
-def _distant(worlds: Worlds, direction: Any, active: Any, density: Any, delta: Any, left: Any) -> Any:
-    """Light that a direction, drawn with ``density``, finds far away; ``left``: not of the emitters."""
+def _distant(
+    worlds: Worlds, groups: Sequence[LightGroup], direction: Any, active: Any, density: Any, delta: Any, left: Any
+) -> Any:
+    """Light of the groups that a direction, drawn with ``density``, finds; ``left``: not that of the emitters."""
     import drjit as dr
 
     mi = worlds.mi
     total = mi.Color3f(0.0)
-    for group in worlds.lights:
+    for group in groups:
         emitter = group.scene.environment()
         away = dr.zeros(mi.SurfaceInteraction3f)
         away.wi = -direction

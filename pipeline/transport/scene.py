@@ -44,6 +44,7 @@ class Worlds:
     without_objects: Any
     local_with: tuple[Any, ...]
     lights: tuple[LightGroup, ...]
+    whole: LightGroup  # all of them together
     lights_above: tuple[LightGroup, ...]  # only what can reach the local scene, where that is a plane
     plane: Plane
     bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
@@ -206,6 +207,7 @@ def build_worlds(
         without_objects=without,
         local_with=local_with,
         lights=lights,
+        whole=light_group(mi, "all", environment, False),
         lights_above=lights if proxies else (sky_above(mi, environment, emitters, plane.normal), *lights[1:]),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
