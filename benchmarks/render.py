@@ -187,7 +187,10 @@ def main() -> None:
     record: dict[str, Any] = {}
     if given.scenes != ",".join(SCENES) and (given.out / "render.json").exists():
         record = json.loads((given.out / "render.json").read_text())
-    record |= {name: measure(SCENES[name](width, height), budget, threads, say) for name in given.scenes.split(",")}
+    given.out.mkdir(parents=True, exist_ok=True)
+    for name in given.scenes.split(","):
+        record[name] = measure(SCENES[name](width, height), budget, threads, say)
+        (given.out / "render.json").write_text(json.dumps(record, indent=1) + "\n")
     if "tiny" not in record:
         record["tiny_24mpx_over_1mpx"], record["tiny"] = tiny_ratio(budget.replicates)
         say(f"24 over 1 Mpx: {record['tiny_24mpx_over_1mpx']:.2f}")
@@ -198,7 +201,6 @@ def main() -> None:
     if record.get("zscore_max") is None:
         record["zscore_max"] = zscore()
     record["size"], record["threads"], record["wall_s"] = [width, height], threads, time.time() - started
-    given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "render.json").write_text(json.dumps(record, indent=1) + "\n")
     write_page(record, given.out)
     say(f"wrote {given.out / 'render.md'}")
