@@ -412,7 +412,18 @@ def evaluate_part(build: Build) -> dict[str, Any]:
             fig.heat_figure(pictures.shrink(errors["flip"], WIDTH), 0.4, "FLIP", "what an eye would notice", ""),
             fig.class_figure(errors["class"][::2, ::2], KINDS, "Where it is scored", "masks from truth"),
         ]  # fmt: skip
-    return {"figures": maps, "tables": [table], "cards": checks(build)}
+    return {"figures": maps, "tables": [table, *waterfall(build)], "cards": checks(build)}
+
+
+def waterfall(build: Build) -> list[dict[str, Any]]:
+    """Where the error comes from: errors with the truth in place of what stages estimated, when that was asked for."""
+    errors = build.records.get("evaluate", {}).get("waterfall") or {}
+    if not errors:
+        return []
+    keys = list(next(iter(errors.values())))
+    head = ["truth in place of", *(key.removesuffix("_err").removesuffix("_rel").replace("_", " ") for key in keys)]
+    rows = [[label, *(f"{row[key]:.4f}" for key in keys)] for label, row in errors.items()]
+    return [{"title": "Where the error comes from", "head": head, "rows": rows, "numeric": True}]
 
 
 PARTS: dict[str, Callable[[Build], dict[str, Any]]] = {

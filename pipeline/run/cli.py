@@ -245,12 +245,12 @@ def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
     from pipeline.run.derive import print_summary, unfinished
 
     if getattr(args, "with_truth", None):
-        from pipeline.run.formats import write_bytes
         from pipeline.run.substitution import FIGURES, waterfall
 
         say(f"{'truth in place of':<32}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
         found = waterfall(build, [name.strip() for name in args.with_truth.split(",")], say)
-        write_bytes(build.out / "waterfall.json", json.dumps(found, indent=1).encode() + b"\n")
+        build.keep_waterfall(found)
+        build.run(build.graph["report"])  # it shows the waterfall
         return 0
     stages = build.graph.upto(last) if args.verb == "run" else [build.graph[args.stage]]
 

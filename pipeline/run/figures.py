@@ -48,7 +48,7 @@ def read_build(folder: Path) -> dict[str, Any]:
         "seconds": sum(record["seconds"] for record in records),
         "cpu": sum(record["cpu_seconds"] for record in records),
         "stages": {record["stage"]: record for record in records},
-        "waterfall": json.loads(path.read_bytes()) if (path := folder / "waterfall.json").exists() else {},
+        "waterfall": json.loads(path.read_bytes())["errors"] if (path := folder / "waterfall.json").exists() else {},
     }
 
 

@@ -93,7 +93,25 @@ class Build:
         """numbers, warnings, evidence, params (and seconds) of the stages before this one."""
         keys = ["numbers", "warnings", "evidence", "params", "versions", *(["seconds"] if timing else [])]
         records = {parent.name: self.record(parent.name) or {} for parent in self.graph.parents(stage)}
-        return {name: {key: record.get(key) for key in keys} for name, record in records.items()}
+        told = {name: {key: record.get(key) for key in keys} for name, record in records.items()}
+        if "evaluate" in told:
+            told["evaluate"]["waterfall"] = self.waterfall()
+        return told
+
+    def waterfall(self) -> dict[str, dict[str, float]]:
+        """Errors with truth in place of what stages estimated, if `keep_waterfall` was told of this very composite."""
+        try:
+            found = json.loads((self.out / "waterfall.json").read_bytes())
+        except (FileNotFoundError, ValueError):
+            return {}
+        current = (self.record("composite") or {"outputs": {}})["outputs"].get("composite")
+        return found["errors"] if current and found.get("composite") == current else {}
+
+    def keep_waterfall(self, errors: dict[str, dict[str, float]]) -> None:
+        """Write what `waterfall` reads."""
+        current = (self.record("composite") or {"outputs": {}})["outputs"].get("composite")
+        text = json.dumps({"composite": current, "errors": errors}, indent=1)
+        formats.write_bytes(self.out / "waterfall.json", text.encode() + b"\n")
 
     @contextlib.contextmanager
     def locked(self, stage: Stage) -> Iterator[None]:
