@@ -111,20 +111,26 @@ def refine(
             come if none leaves, of one half.
         thrown: light tracing for as many samples of a pixel, with a seed: (N, 3) to add to the gained light.
         start: where an earlier run stopped. The result is the same to the byte as without stopping.
-        progress: told the share of samples done; may raise `Interrupted`.
+        progress: told the share of samples done, which never falls and ends at 1; may raise `Interrupted`.
     """
     steps, plain = schedule(samples)
     halves = start or Halves.none(len(rays))
-    spent = 0
+    spent, told = 0, 0.0
+
+    def forward(share: float) -> None:
+        nonlocal told
+        told = max(told, share)  # the first pass finds objects, and with them more to do
+        progress(told)
+
     for number in range(halves.passes, len(steps)):
         index = np.flatnonzero(halves.open)
         if not len(index):
-            return
+            break
         step, on_object = steps[number], (halves.first.alpha + halves.second.alpha) > 0
         ahead = _ahead(halves.open, on_object, steps, plain, number) or 1
         parts, light = [], halves.thrown.copy()
         for half, part in enumerate((halves.first, halves.second)):
-            tell = _part(progress, spent, len(index) * step, ahead, half)
+            tell = _part(forward, spent, len(index) * step, ahead, half)
             more = trace(strategy, worlds, rays[index], step, depth, seed + 2 * number + half, progress=tell)
             parts.append(part.placed(index, more))
             if thrown is not None and number < plain:
@@ -138,6 +144,7 @@ def refine(
         if ahead:
             halves = replace(halves, open=halves.open & noisy(halves, ahead))
         yield halves
+    progress(1.0)
 
 
 def _ahead(still: np.ndarray, on_object: np.ndarray, steps: list[int], plain: int, number: int) -> int:
