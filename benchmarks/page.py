@@ -37,9 +37,8 @@ the two strategies that treat all pixels alike are traced, their cost counted ni
   denoised.
 - **insitu**: that, denoised: what the render stage delivers with the knobs of preview, after each pass. The
   photograph's noise is taken to be 1 % of the radiance.
-- **Cycles** (Blender {version}): shadow catcher, 8 bounces, box filter, no clamp, no adaptive sampling. Its error is
-  from the difference of replicates, so a mean that is not ours costs it nothing; its cost is the slope of CPU seconds
-  by samples, without the fixed cost of a frame.
+- **Cycles** (Blender {version}): shadow catcher, 8 bounces, box filter, no clamp, no adaptive sampling. Its cost
+  is the slope of CPU seconds by samples, without the fixed cost of a frame.
 
 A speed-up is the ratio of CPU seconds at equal error: a strategy's own seconds at its largest sample count, against
 those at which the other reaches the same error on its own curve, continued as 1 / time. For region and denoiser, which
