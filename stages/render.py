@@ -281,7 +281,7 @@ def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
     samples = halves.both
     model = samples.albedo * canvas.light_at(canvas.traced) / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
-    covered = samples.alpha > 0.99
+    covered = (samples.alpha > 0.99) & (samples.obj > 0).any(1)
     weight = canvas.region.weight
     numbers: dict[str, Any] = {
         "influenced_fraction": float((weight > 0).mean()),
