@@ -29,6 +29,7 @@ from stages import render
 ALBEDO = np.array([0.5, 0.4, 0.3])
 FRAME = (96, 128)
 SIGMA = 0.01  # of the plate
+SAMPLES = 320  # several passes
 TRUTH = 128  # samples per pixel
 
 
@@ -56,7 +57,7 @@ def adaptive() -> tuple[Canvas, Halves, dict[str, float], Limits]:
     variance = np.square(SIGMA * model)
     limits = limits_for(plate, variance, 0.004)
     sigma = np.sqrt(variance.mean(-1))
-    effort = Effort(samples=128, denoise=False, seed=5)
+    effort = Effort(samples=SAMPLES, denoise=False, seed=5)
     canvas, left = prepare(worlds, rays, FRAME, upward(sky()), sigma, float(plate.max()), limits, effort)
     *_, shot = sampled(canvas)
     return canvas, shot.halves, left, limits
@@ -114,9 +115,9 @@ def test_the_regions_border_is_hidden_by_the_photographs_noise() -> None:
 def test_sampling_stops_where_the_photograph_hides_the_noise() -> None:
     """Most of the shadow leaves early; no pixel takes more than its share, but for a grid of strata (32 become 35)."""
     count, alpha = (getattr(adaptive()[1].both, name) for name in ("count", "alpha"))
-    assert (count[alpha == 0] < 128).mean() > 0.5
-    assert count[alpha == 0].max() <= 128 * 1.1
-    assert count.max() <= OBJECT_BOOST * 128 * 1.1
+    assert (count[alpha == 0] < SAMPLES).mean() > 0.5
+    assert count[alpha == 0].max() <= SAMPLES * 1.1
+    assert count.max() <= OBJECT_BOOST * SAMPLES * 1.1
     assert count.min() >= 2 * TRUSTED
 
 

@@ -17,7 +17,7 @@ from pipeline.transport.trace import NEVER, camera_rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Emitter
 
-SAMPLES = 96
+SAMPLES = 64
 OBJECTS = {
     "metal": ((0.1, (0, 0.1, 0)), Material((0.9, 0.8, 0.5), 1.0, 0.4)),
     "glass": ((0.06, (0.19, 0.06, 0.05)), Material((1.0, 0.9, 0.8), transmission=1.0)),
