@@ -124,7 +124,7 @@ def halves_of(world: tuple[str, str, str], relative: float, fireflies: float, se
 
 def quiet_world(world: tuple[str, str, str], a: Half, b: Half) -> QuietChange:
     albedo = (TEXTURE if world[2] == "textured object" else np.zeros_like(TEXTURE)) * ALPHA[..., None]
-    return quieted(a, b, ALPHA, albedo, np.zeros_like(TEXTURE), 1.0, False)
+    return quieted(a, b, ALPHA, albedo, np.zeros_like(TEXTURE), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +266,7 @@ def test_without_object_or_without_ground(covered: float) -> None:
         Half(**{k: v[:61, 85:] * (covered if k == "obj" else 1 - covered) for k, v in vars(half).items()})
         for half in (a, b)
     ]
-    result = quieted(*cut, alpha, TEXTURE[:61, 85:] * covered, TEXTURE[:61, 85:] * 0, 1.0, True)
+    result = quieted(*cut, alpha, TEXTURE[:61, 85:] * covered, TEXTURE[:61, 85:] * 0, 1.0)
     assert result.obj.rgb.shape == (61, 83, 3)
     assert np.isfinite(result.noise(np.ones((8, 11)))).all()
     assert result.obj.rgb.any() == bool(covered)

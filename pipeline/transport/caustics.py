@@ -25,7 +25,7 @@ from pipeline.transport.directions import direction_density
 from pipeline.transport.scene import LightGroup, Worlds
 
 MIRRORS = 12  # longest chain of mirrors and glass surfaces
-PHOTONS_PER_SAMPLE = 0.04  # photons for every pixel of the photograph and every sample that a pixel gets
+PHOTONS_PER_SAMPLE = 0.3  # photons for every pixel and every sample of it
 PHOTONS_PER_BLOCK = 1 << 21
 
 
@@ -48,7 +48,7 @@ def throws(worlds: Worlds) -> bool:
 
 
 def photons_for(worlds: Worlds, pixels: int) -> float:
-    """Photons for every sample of a pixel and every emitter, of a photograph of so many pixels."""
+    """Photons for one sample of each of so many pixels, of every emitter."""
     return PHOTONS_PER_SAMPLE * pixels / max(1, sum(group.compact for group in worlds.lights))
 
 

@@ -21,6 +21,7 @@ from pipeline.transport.denoise import (
     QuietChange,
     bounding_window,
     denoise,
+    glimpsed,
     needs_more,
     quieted,
     tile_means,
@@ -32,10 +33,12 @@ from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples, Strategy, centre_albedo, reference_block, trace, unchanged_block
 
 STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
-PILOT_SHARE = 4  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
+PILOT_SHARE = 2  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
+MOST_PILOT = 512
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
 PILOT_PHOTONS = 2  # samples' worth
+PILOT_PIXELS = 1 << 20  # most pixels whose worth of photons a pilot takes
 WORTH_TRACING = 0.02  # of the added light: less of it in caustics is left to paths from the camera
 JUDGED = (
     "obj", "lost", "gained", "albedo", "alpha", "obj_albedo", "obj_normal", "obj_variance", "change_variance",
@@ -116,11 +119,11 @@ def prepare(
         tell: gives a progress callback for a named task.
     """
     index, grid = cell_pixels(*shape)
-    samples = max(64, PILOT_SHARE * effort.samples)
+    samples = min(max(16, PILOT_SHARE * effort.samples), MOST_PILOT)
     closed = worlds.convex and worlds.diffuse
     film = film if effort.strategy == "difference" and throws(worlds) else None
     if film is not None:
-        worlds = replace(worlds, photons=photons_for(worlds, shape[0] * shape[1]))
+        worlds = replace(worlds, photons=photons_for(worlds, min(shape[0] * shape[1], PILOT_PIXELS)))
     pilot = trace(
         difference_block, worlds, rays[index], samples, effort.depth, effort.seed + 1, CELL, tell("render: pilot")
     )
@@ -135,6 +138,8 @@ def prepare(
     region, left = plan(pilot, pilot.albedo * cell_light / np.pi, grid, shape, limits)
     if effort.strategy == "reference" or not effort.adaptive:
         region = replace(region, traced=region.weight > 0)
+    if film is not None:
+        worlds = replace(worlds, photons=photons_for(worlds, int(region.traced.sum())))
     canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort, film)
     return lit(canvas, worlds, light, tell), left | {"light_traced_share": share}
 
@@ -224,14 +229,14 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
 
     Asked only where the samples still to come (``ahead``, of all pixels and one half) cost several times the answer.
     """
-    window = bounding_window(scattered(canvas, halves.open))
+    window = bounding_window(scattered(canvas, halves.open) > 0)
     area = np.zeros(canvas.shape)[window].size
     if halves.a.count.max() < TRUSTED or ahead < JUDGE_SAMPLES * area:
         return halves.open
     images = planes_of(canvas, halves.both, JUDGED, window)
     composite = (images["obj"] + images["without"] + images["lost"] + images["gained"]).mean(-1)
     if canvas.effort.denoise:
-        noise = quiet_in(canvas, halves, images, window, fast=False).noise(tile_means(images["without"].mean(-1)))
+        noise = quieted(*halves_in(canvas, halves, images, window)).noise(tile_means(images["without"].mean(-1)))
     else:
         noise = np.sqrt(tile_means((images["obj_variance"] + images["change_variance"]).mean(-1)))
     more = needs_more(noise, canvas.plate_sigma[window], tile_means(composite), canvas.white)
@@ -243,7 +248,7 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
 
 def scattered(canvas: Canvas, values: np.ndarray) -> np.ndarray:
     """Values (N, ...) of the traced pixels as a picture (H, W, ...), zero elsewhere."""
-    image = np.zeros((canvas.shape[0] * canvas.shape[1], *values.shape[1:]), values.dtype)
+    image = np.zeros((canvas.shape[0] * canvas.shape[1], *values.shape[1:]), np.float32)
     image[canvas.traced] = values
     return image.reshape(*canvas.shape, *values.shape[1:])
 
@@ -271,28 +276,36 @@ def planes_of(
     return images
 
 
-def quiet_in(
-    canvas: Canvas, halves: Halves, images: dict[str, np.ndarray], window: tuple[slice, slice], fast: bool
-) -> QuietChange:
-    """The denoiser's work on a window; ``images`` holds both halves' alpha and guides there."""
+def halves_in(
+    canvas: Canvas, halves: Halves, images: dict[str, np.ndarray], window: tuple[slice, slice]
+) -> tuple[Half, Half, np.ndarray, np.ndarray, np.ndarray, float]:
+    """What the denoiser wants to know of a window; ``images`` holds both halves' alpha and guides there."""
     parts = []
     for samples in (halves.a, halves.b):
         part = planes_of(canvas, samples, ("lost", "gained", "albedo", "obj"), window)
         parts.append(Half(part["lost"], part["gained"], part["without"], part["obj"]))
-    return quieted(parts[0], parts[1], images["alpha"], images["obj_albedo"], images["obj_normal"], canvas.white, fast)
+    return parts[0], parts[1], images["alpha"], images["obj_albedo"], images["obj_normal"], canvas.white
 
 
 def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], QuietChange | None]:
-    """Every field as a picture (H, W, ...), zero where nothing was computed; and what the denoiser says of its work."""
+    """Every field as a picture (H, W, ...), zero where nothing was computed; and what the denoiser says of its work.
+
+    It says nothing of fewer than `TRUSTED` samples.
+    """
     images = planes_of(canvas, halves.both, (*JUDGED, "ground"), (slice(None), slice(None)))
     if not canvas.effort.denoise:
         return images, None
     window = bounding_window(canvas.region.traced)
     view = {name: image[window] for name, image in images.items()}
-    quiet = quiet_in(canvas, halves, view, window, fast=halves.a.count.max() < TRUSTED)
+    given = halves_in(canvas, halves, view, window)
+    quiet = None if halves.a.count.max() < TRUSTED else quieted(*given)
+    if quiet is None:
+        survives, added, obj = glimpsed(*given, fast=halves.passes == 1)
+    else:
+        survives, added, obj = quiet.survives.rgb, quiet.added.rgb, quiet.obj.rgb
     here, model = canvas.region.traced[window][..., None], view["without"]
     ground, shown = here & (model > 0), here & (view["alpha"][..., None] > 0)
-    view["lost"][:] = np.where(ground, np.minimum(quiet.survives.rgb - 1, 0) * model, view["lost"])
-    view["gained"][:] = np.where(ground, quiet.added.rgb * model, view["gained"])
-    view["obj"][:] = np.where(shown, quiet.obj.rgb, view["obj"])
+    view["lost"][:] = np.where(ground, np.minimum(survives - 1, 0) * model, view["lost"])
+    view["gained"][:] = np.where(ground, added * model, view["gained"])
+    view["obj"][:] = np.where(shown, obj, view["obj"])
     return images, quiet

@@ -14,7 +14,8 @@ import numpy as np
 from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples, Strategy, trace
 
-LONGEST = 32  # samples per pixel, half and pass: how much an interruption may lose
+FIRST = 2  # samples per pixel and half of the first pass; with one, the renderer would compile anew for every seed
+LONGEST = 64  # samples per pixel, half and pass: how much an interruption may lose
 OBJECT_BOOST = 4  # a pixel that shows an object may take that many times the samples
 
 
@@ -75,14 +76,19 @@ class Halves:
 def schedule(samples: int) -> tuple[list[int], int]:
     """Samples per pixel and half of each pass, and how many passes belong to pixels without an object.
 
-    The total doubles, by at most `LONGEST` a pass, up to ``samples`` (both halves), then for objects up to
-    `OBJECT_BOOST` times as many.
+    First a few for a picture to look at, then as many at once as `LONGEST` allows: samples of one pass share their
+    strata, those of two do not. In all ``samples`` (both halves), and `OBJECT_BOOST` times as many for objects.
     """
     steps: list[int] = []
+    plain = 0
     for wanted in (max(1, (samples + 1) // 2), max(1, (samples * OBJECT_BOOST + 1) // 2)):
         plain = len(steps)
-        while sum(steps) < wanted:
-            steps.append(min(max(sum(steps), 1), LONGEST, wanted - sum(steps)))
+        if not steps:
+            steps.append(min(FIRST, wanted))
+        rest = wanted - sum(steps)
+        passes = -(-rest // LONGEST)
+        steps += [rest // passes + (number < rest % passes) for number in range(passes)]
+        plain = plain or len(steps)
     return steps, plain
 
 
