@@ -1,19 +1,24 @@
 """The render stage against the lens and the plate: half pixels, texture flips, rotation of the world, the region."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import cv2
 import numpy as np
+from test_composite_render import inputs, wish
 from test_transport import GREY, camera, ground, looking_down, sky, sphere
 
 from pipeline.camera.lens import project, ray_grid
 from pipeline.conventions import HALF_PIXEL, invert_rigid, transform_points
 from pipeline.light.environment import irradiance
+from pipeline.run import progress
 from pipeline.transport.difference import difference_block
 from pipeline.transport.region import CELL, LEAST, Limits, cell_pixels, interpolate, limits_for, plan
 from pipeline.transport.scene import build_worlds
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
-from pipeline.types import Camera, Plane, Raster, Surface
+from pipeline.types import Camera, Plane, Raster, Result, Surface
 from stages import knobs, render
 
 MARKER_SIDE = 0.16
@@ -148,3 +153,53 @@ def test_no_objects_give_empty_layers() -> None:
     result = render.compute(wishes={"object": []}, **everything)
     assert not any(values.any() for values in result.outputs["layers"].channels.values())
     assert result.warnings
+
+
+class Stops(progress.Host):
+    """Wants to stop after so many checkpoints."""
+
+    def __init__(self, after: int, saved: dict[str, np.ndarray] | None = None) -> None:
+        self.after, self.saved, self.saves, self.offers = after, saved, 0, 0
+
+    def offer(self, make: Callable[[], Result]) -> None:
+        assert set(make().outputs) == {"layers"}
+        self.offers += 1
+
+    def interrupted(self) -> bool:
+        return self.saves >= self.after
+
+    def checkpoint_load(self) -> dict[str, np.ndarray] | None:
+        return self.saved
+
+    def checkpoint_save(self, make: Callable[[], dict[str, np.ndarray]]) -> None:
+        self.saved, self.saves = make(), self.saves + 1
+
+
+def test_an_interrupted_render_keeps_its_passes_and_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Broken off within the second pass: the picture of the first, said to be incomplete; then the whole."""
+    params = {"samples": 12, "denoise": False}
+    wishes = [wish(tmp_path, 0.0, base_color=[0.6, 0.3, 0.2])]
+
+    def rendered(host: progress.Host) -> Result:
+        with progress.hosted(host):
+            return render.compute(
+                wishes={"object": wishes},
+                **inputs(),
+                surface=Surface(),
+                local_proxies=[],
+                params=knobs.Render(**params),
+            )
+
+    whole, stopped = rendered(progress.NOBODY), Stops(1)
+    part = rendered(stopped)
+    assert stopped.offers == 1
+    assert part.numbers["complete"] is False
+    assert 0 < part.numbers["share_done"] < 1
+    assert part.numbers["passes"] == 1
+    assert any("interrupted" in warning for warning in part.warnings)
+    again = rendered(Stops(99, stopped.saved))
+    assert "complete" not in again.numbers
+    assert again.numbers == whole.numbers
+    for name, values in whole.outputs["layers"].channels.items():
+        assert values.tobytes() == again.outputs["layers"][name].tobytes()
+        assert np.isfinite(values).all()
