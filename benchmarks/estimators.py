@@ -138,7 +138,7 @@ def reference(stage: Loaded, plate: np.ndarray, samples: tuple[int, int], seed: 
     worlds, picture = stage.worlds, np.zeros_like(plate)
     if specular:
         worlds = replace(worlds, photons=photons_for(worlds, stage.film.pixel_sr.size))
-        picture += thrown(worlds, stage.film, PHOTON_SAMPLES, seed + 2).reshape(-1, 3)[stage.pixels]
+        picture += thrown(worlds, stage.film, PHOTON_SAMPLES, seed + 2).sum(0).reshape(-1, 3)[stage.pixels]
     for count, index in zip(samples, (np.flatnonzero(~noisy), np.flatnonzero(noisy)), strict=True):
         if len(index):
             part = trace(difference_block, worlds, stage.rays[index], count, REFERENCE_DEPTH, seed + 1)

@@ -70,14 +70,15 @@ def wall() -> Proxy:
     return Proxy(name="wall", vertices_m=box.vertices, faces=box.faces, albedo=[0.8, 0.6, 0.4])
 
 
-def changes(worlds: Worlds, photons: float, seeds: range) -> list[np.ndarray]:
-    """What the objects change, (pixels, 3), of independent renders, the thrown light in it."""
+def changes(worlds: Worlds, photons: float, seeds: range, objects: bool = False) -> list[np.ndarray]:
+    """What the objects change, or are and change, (pixels, 3), of independent renders, the thrown light in it."""
     worlds = replace(worlds, photons=photons)
     pictures = []
     for seed in seeds:
         samples = trace(difference_block, worlds, all_rays(), SAMPLES, 16, seed)
-        light = thrown(worlds, film(), SAMPLES, 1000 + seed).reshape(-1, 3) if photons else 0.0
-        pictures.append(samples.lost + samples.gained + light)
+        light = thrown(worlds, film(), SAMPLES, 1000 + seed).reshape(2, -1, 3) if photons else np.zeros(2)
+        own = samples.obj + light[1] if objects else 0.0
+        pictures.append(samples.lost + samples.gained + light[0] + own)
     return pictures
 
 
@@ -98,15 +99,16 @@ def test_with_light_tracing_as_without_as_the_reference(place: str) -> None:
         surface=Surface(model="rough", roughness=0.4, f0=0.04) if place == "glossy" else None,
     )
     assert throws(worlds)
-    shared = changes(worlds, PHOTONS, range(REPEATS))
+    shared = changes(worlds, PHOTONS, range(REPEATS), objects=True)
     both = [trace(reference_block, worlds, all_rays(), 8 * SAMPLES, 16, 100 + seed) for seed in range(REPEATS)]
-    reference = [samples.lost + samples.gained for samples in both]
+    reference = [samples.lost + samples.gained + samples.obj for samples in both]
     assert_same_mean(shared, reference, SIZE)
     if place != "plane":
         return
-    alone = changes(worlds, 0.0, range(50, 50 + REPEATS))
+    alone = changes(worlds, 0.0, range(50, 50 + REPEATS), objects=True)
     assert_same_mean(shared, alone, SIZE)
-    assert np.var(alone, 0, ddof=1).mean() > 1.5 * np.var(shared, 0, ddof=1).mean()
+    with_light, without = (changes(worlds, photons, range(REPEATS)) for photons in (PHOTONS, 0.0))
+    assert np.var(without, 0, ddof=1).mean() > 1.5 * np.var(with_light, 0, ddof=1).mean()
 
 
 def small_lamp(height: int = 256) -> tuple[np.ndarray, Emitter]:
@@ -157,7 +159,7 @@ class FlatMirror:
         self.worlds = replace(worlds, photons=0.2 * SIZE[0] * SIZE[1])
 
     def thrown(self, film: Film) -> np.ndarray:
-        return thrown(self.worlds, film, 256, 5)
+        return thrown(self.worlds, film, 256, 5)[0]
 
 
 def ground_points() -> tuple[np.ndarray, np.ndarray]:
@@ -216,7 +218,7 @@ def test_what_stands_before_the_camera_hides_thrown_light() -> None:
     worlds = build_worlds(ground(), ALBEDO, light, throwing_objects(), emitters=[lamp_of(light)])
     worlds = replace(worlds, photons=PHOTONS)
     alpha = trace(difference_block, worlds, all_rays(), 64, 2, 0).alpha.reshape(SIZE)
-    assert not thrown(worlds, film(), 64, 3)[minimum_filter(alpha == 1, 3)].any()
+    assert not thrown(worlds, film(), 64, 3)[0][minimum_filter(alpha == 1, 3)].any()
 
 
 def test_a_part_of_the_frame_gets_its_part() -> None:

@@ -38,7 +38,7 @@ def drawn(worlds: Any, rays: Rays, samples: int, depth: int, seed: int, footprin
 
 def light(samples: int, seed: int) -> np.ndarray:
     """Light tracing without a scene."""
-    return np.random.default_rng(1000 + seed).uniform(size=(PIXELS, 3))
+    return np.random.default_rng(1000 + seed).uniform(size=(2, PIXELS, 3))
 
 
 def every(halves: Halves, ahead: int) -> np.ndarray:

@@ -3,11 +3,12 @@
 A path from the camera finds the mirror image of the sun in an object by chance only; a path from the sun finds it
 always. So paths emitter - object(s) - local scene - camera are also built from the light: directions and points of the
 emitter's light on discs around the objects, on along the BSDFs, and where a local surface is met that the camera sees,
-into its pixel. Two kinds of such paths come from here:
+into its pixel. Three kinds of such paths come from here:
 
 * off one object: shared with the paths from the camera by multiple importance sampling (balance heuristic), whatever
   the material, so that each finds what it is good at;
-* along mirrors and glass of any number: from here alone, since camera paths cannot (a small light, a delta BSDF).
+* along mirrors and glass of any number: from here alone, since camera paths cannot (a small light, a delta BSDF);
+* along mirrors and glass to a rough object that the camera sees: likewise.
 
 Light of the sky, and what bounces more than once off rough objects, stays with the camera's paths.
 Arvo, *Backward ray tracing*, 1986; Veach, *Robust Monte Carlo methods for light transport simulation*, 1997, ch. 10.
@@ -86,13 +87,13 @@ def against_camera(worlds: Worlds, hit: Any, back: Any, light: Any) -> Any:
 
 
 def thrown(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
-    """(H, W, 3) radiance of the local scene by light that emitters send to it by way of the objects.
+    """(2, H, W, 3) radiance of the local scene, and of objects, by light that emitters send there by way of objects.
 
     Takes ``worlds.photons`` photons for each of ``samples`` samples of a pixel, for each emitter. Add it to what paths
     from the camera find with the same ``worlds.photons``; together they are unbiased.
     """
     height, width = film.pixel_sr.shape
-    picture = np.zeros((height * width, 3))
+    picture = np.zeros((3, 2 * height * width))
     lamps = [group for group in worlds.lights if group.compact]
     wanted = max(1, round(worlds.photons * samples))
     for number, lamp in enumerate(lamps):
@@ -104,21 +105,22 @@ def thrown(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
                 column, row = np.floor(pixel).T
                 inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
             index = (row[inside] * width + column[inside]).astype(int)
+            layer = index + height * width * landed["on_object"][inside].astype(int)
             per_area = landed["per_area"][inside] / film.pixel_sr.ravel()[index]  # pixels per m^2 of the surface
             ratio = landed["ratio"][inside] / per_area
             share = np.where(np.isinf(ratio), 1.0, ratio / (1 + np.where(np.isinf(ratio), 0, ratio)))
             value = landed["value"][inside] * (share * per_area / wanted)[:, None]
             for channel in range(3):
-                picture[:, channel] += np.bincount(index, value[:, channel], height * width)
-    return picture.reshape(height, width, 3)
+                picture[channel] += np.bincount(layer, value[:, channel], 2 * height * width)
+    return np.moveaxis(picture.reshape(3, 2, height, width), 0, -1)
 
 
 def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Photons that reached a local surface which the camera sees.
+    """Photons that reached a local surface, or by mirrors a rough object, which the camera sees.
 
     ``point`` (N, 3); ``value`` (N, 3) BSDF towards the camera times flux; ``per_area`` (N,) cosine over squared
     distance to the camera, [sr / m^2]; ``ratio`` (N,) density against paths from the camera but for pixels per area,
-    infinite where no such path competes.
+    infinite where no such path competes; ``on_object`` (N,) 0 or 1.
     """
     import drjit as dr
 
@@ -141,7 +143,8 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
         active, ray, flux, ratio, left, landed, found, sampler = state
         hit = scene.ray_intersect(ray, active=active)
         local = worlds.is_local(hit)
-        arrives = active & local & (left < MIRRORS)
+        rough = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Smooth)
+        arrives = active & hit.is_valid() & (left < MIRRORS) & (local | (rough & dr.isinf(ratio)))
         found = dr.select(arrives, hit, found)
         landed |= arrives
         # On an object: after a rough one the path ends at the next surface, whatever that is.
@@ -155,10 +158,10 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
         weight *= dr.abs(cos_in * going / (cos_out * coming))
         flux = dr.select(onward, flux * weight, flux)
         delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
-        rough = onward & ~delta
+        scatters = onward & ~delta
         onward &= dr.any(flux != 0) & (delta | (left == MIRRORS))  # rough only as the first and only one
         off_one = against_camera(worlds, hit, outward, -ray.d)
-        ratio = dr.select(rough, off_one, ratio)
+        ratio = dr.select(scatters, off_one, ratio)
         return onward, dr.select(onward, hit.spawn_ray(outward), ray), flux, ratio, left - 1, landed, found, sampler
 
     infinite = dr.full(mi.Float, float("inf"), count)
@@ -193,8 +196,9 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     ratio = dr.select(density > 0, ratio * cosine / density, float("inf"))
     per_area = dr.abs(dr.dot(found.n, toward)) / dr.square(distance)
     keep = landed & dr.all(dr.isfinite(value))
-    numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio)]
+    on_object = dr.select(worlds.is_local(found), mi.Float(0.0), mi.Float(1.0))
+    numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio, on_object)]
     dr.eval(keep, numbers)  # once, else every gather below would run the whole kernel again
     index = mi.UInt32(dr.compress(keep))
     rows = np.stack([np.asarray(dr.gather(mi.Float, number, index)) for number in numbers]).astype(float)
-    return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7]}
+    return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7], "on_object": rows[8]}

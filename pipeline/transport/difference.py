@@ -46,7 +46,7 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     # One path per sample: on from the camera where an object is seen, else along the direction that met an object.
     parted = dr.any(beta != 0)
     onward = mi.Ray3f(dr.select(on_object, ray.o, split.o), dr.select(on_object, ray.d, split.d))
-    shared = None if worlds.photons == 0 else caustic(worlds, rays, count, ray, hit, split, density)
+    shared = None if worlds.photons == 0 else caustic(worlds, rays, count, ray, hit, on_object, split, density)
     found = trace_paths(worlds, worlds.with_objects, sampler, onward, on_object | parted, depth, shared)
     gained = dr.select(parted, found * beta, zero)
     if not worlds.convex:
@@ -65,7 +65,9 @@ def difference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed:
     )
 
 
-def caustic(worlds: Worlds, rays: Rays, count: int, ray: Any, hit: Any, split: Any, density: Any) -> Caustic:
+def caustic(
+    worlds: Worlds, rays: Rays, count: int, ray: Any, hit: Any, on_object: Any, split: Any, density: Any
+) -> Caustic:
     """What paths that left the point ``hit`` along ``split``, with ``density``, share with light tracing."""
     import drjit as dr
 
@@ -79,7 +81,7 @@ def caustic(worlds: Worlds, rays: Rays, count: int, ray: Any, hit: Any, split: A
     def against(point: Any, along: Any, light: Any) -> Any:
         return against_camera(worlds, point, -along.d, light) * scale
 
-    return Caustic(active, against)
+    return Caustic(active, on_object, against)
 
 
 def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> tuple[Any, ...]:

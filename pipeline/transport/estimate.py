@@ -129,7 +129,7 @@ def prepare(
     )
     share = 0.0
     if film is not None:
-        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.seed + 1))
+        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.seed + 1)[0])
         share = float(light_by_cell.sum() / max((pilot.gained + light_by_cell).sum(), 1e-30))
         pilot = replace(pilot, gained=pilot.gained + light_by_cell)
         if share < WORTH_TRACING:
@@ -214,7 +214,7 @@ def sampled(
 
     def light(samples: int, seed: int) -> np.ndarray:
         assert canvas.film is not None
-        return thrown(canvas.worlds, canvas.film, samples, seed).reshape(-1, 3)[canvas.traced]
+        return thrown(canvas.worlds, canvas.film, samples, seed).reshape(2, -1, 3)[:, canvas.traced]
 
     rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.seed + 2
     strategy, traced_light = STRATEGIES[effort.strategy], light if canvas.film is not None else None

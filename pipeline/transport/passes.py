@@ -33,30 +33,29 @@ class Halves:
 
     first: Samples
     second: Samples
-    thrown: np.ndarray  # (2, N, 3)
+    thrown: np.ndarray  # (2, 2, N, 3): half, then local scene or object
     passes: int
     open: np.ndarray  # (N,) bool, pixels that want more samples
 
     @classmethod
     def none(cls, pixels: int) -> Halves:
         """Before the first pass."""
-        return cls(Samples.none(pixels), Samples.none(pixels), np.zeros((2, pixels, 3)), 0, np.ones(pixels, bool))
+        return cls(Samples.none(pixels), Samples.none(pixels), np.zeros((2, 2, pixels, 3)), 0, np.ones(pixels, bool))
 
     @property
     def a(self) -> Samples:
         """One half."""
-        return replace(self.first, gained=self.first.gained + self.thrown[0])
+        return lit_by(self.first, self.thrown[0])
 
     @property
     def b(self) -> Samples:
         """The other."""
-        return replace(self.second, gained=self.second.gained + self.thrown[1])
+        return lit_by(self.second, self.thrown[1])
 
     @property
     def both(self) -> Samples:
         """All samples."""
-        both = self.first + self.second
-        return replace(both, gained=both.gained + self.thrown.mean(0))
+        return lit_by(self.first + self.second, self.thrown.mean(0))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -71,6 +70,11 @@ class Halves:
             Samples(**{f.name: arrays[f"{half}_{f.name}"] for f in fields(Samples)}) for half in ("first", "second")
         )
         return cls(first, second, arrays["thrown"], int(arrays["passes"]), arrays["open"])
+
+
+def lit_by(samples: Samples, thrown: np.ndarray) -> Samples:
+    """Samples of pixels with light traced to the local scene and to objects there, (2, N, 3)."""
+    return replace(samples, gained=samples.gained + thrown[0], obj=samples.obj + thrown[1])
 
 
 def schedule(samples: int) -> tuple[list[int], int]:
@@ -115,7 +119,8 @@ def refine(
         samples: most samples per pixel; pixels that show an object may take `OBJECT_BOOST` times as many.
         noisy: (N,) bool, the pixels whose noise still matters, asked between passes with the number of samples still to
             come if none leaves, of one half.
-        thrown: light tracing for as many samples of a pixel, with a seed: (N, 3) to add to the gained light.
+        thrown: light tracing for as many samples of a pixel, with a seed: (2, N, 3) to add to the gained light
+            and to the object layer.
         start: where an earlier run stopped. The result is the same to the byte as without stopping.
         progress: told the share of samples done, which never falls and ends at 1; may raise `Interrupted`.
     """

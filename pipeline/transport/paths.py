@@ -22,9 +22,11 @@ class Caustic:
 
     ``active``: (N,) rays that left the local scene, where the camera sees it, towards an object. ``against(hit, from,
     light)``: at their first vertex, for light from a direction, the density of light tracing over that of the path.
+    ``seen``: (N,) rays from the camera itself to an object.
     """
 
     active: Any
+    seen: Any
     against: Callable[[Any, Any, Any], Any]
 
 
@@ -55,7 +57,9 @@ def trace_paths(
         active, ray, through, found, length, density, delta, mirrors, sampler = state
         hit = scene.ray_intersect(ray, active=active)
         escaped = active & ~hit.is_valid()
-        left = mirrors | (caustic.active & (length == 1)) if caustic is not None else mi.Bool(False)
+        left = mi.Bool(False)
+        if caustic is not None:
+            left = (mirrors & ~(caustic.seen & (length == 1))) | (caustic.active & (length == 1))
         apart = (length <= 1) | mirrors
         for groups, here in ((worlds.lights, escaped & apart), ((worlds.whole,), escaped & ~apart)):
             found += dr.select(here, through * _distant(worlds, groups, ray.d, here, density, delta, left), 0.0)
@@ -85,7 +89,10 @@ def trace_paths(
         drawn, weight = bsdf.sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
         through = dr.select(onward, through * weight, 0.0)
         delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
-        mirrors &= delta & ~worlds.is_local(hit)
+        kept = mirrors & delta
+        if caustic is not None:
+            kept |= caustic.seen & (length == 0) & ~delta
+        mirrors = kept & ~worlds.is_local(hit)
         onward &= dr.any(through != 0)
         following = hit.spawn_ray(hit.to_world(drawn.wo))
         return onward, following, through, found, length + 1, drawn.pdf, delta, mirrors, sampler
