@@ -145,10 +145,14 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
         local = worlds.is_local(hit)
         rough = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Smooth)
         arrives = active & hit.is_valid() & (left < MIRRORS) & (local | (rough & dr.isinf(ratio)))
+        # Half rough and half mirror: it ends there or goes on, by a coin.
+        either = arrives & ~local & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Delta)
+        arrives &= ~either | (sampler.next_1d(either) < 0.5)
+        flux = dr.select(either, 2 * flux, flux)
         found = dr.select(arrives, hit, found)
         landed |= arrives
         # On an object: after a rough one the path ends at the next surface, whatever that is.
-        onward = active & hit.is_valid() & ~local & dr.isinf(ratio) & (left > 0)
+        onward = active & hit.is_valid() & ~arrives & ~local & dr.isinf(ratio) & (left > 0)
         drawn, weight = hit.bsdf().sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
         outward = hit.to_world(drawn.wo)
         # Shading normals make a BSDF asymmetric (Veach, section 5.3).
