@@ -56,6 +56,11 @@ class Effort:
     seed: int = 0
     adaptive: bool = True  # leave, interpolate, stop early; else every pixel takes all samples
 
+    @property
+    def stream(self) -> int:
+        """Where this seed's random numbers begin: far from the next seed's, which its passes count up to."""
+        return 100_003 * self.seed % 2**31
+
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
@@ -125,11 +130,11 @@ def prepare(
     if film is not None:
         worlds = replace(worlds, photons=photons_for(worlds, min(shape[0] * shape[1], PILOT_PIXELS)))
     pilot = trace(
-        difference_block, worlds, rays[index], samples, effort.depth, effort.seed + 1, CELL, tell("render: pilot")
+        difference_block, worlds, rays[index], samples, effort.depth, effort.stream + 1, CELL, tell("render: pilot")
     )
     share = 0.0
     if film is not None:
-        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.seed + 1)[0])
+        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.stream + 1)[0])
         share = float(light_by_cell.sum() / max((pilot.gained + light_by_cell).sum(), 1e-30))
         pilot = replace(pilot, gained=pilot.gained + light_by_cell)
         if share < WORTH_TRACING:
@@ -179,7 +184,9 @@ def received(
     """(H W, 3) irradiance that explains LS_noobj of a rectangle of pixels, path traced and smoothed."""
     from scipy.ndimage import distance_transform_edt
 
-    traced = trace(unchanged_block, worlds, rays, samples, effort.depth + 1, effort.seed + 5, footprint_px, progress)
+    traced = trace(
+        unchanged_block, worlds, rays, samples, effort.depth + 1, effort.stream + 90_001, footprint_px, progress
+    )
     known = (traced.albedo > 0).all(1).reshape(shape)
     if not known.any():
         return np.zeros((len(rays), 3))
@@ -216,7 +223,7 @@ def sampled(
         assert canvas.film is not None
         return thrown(canvas.worlds, canvas.film, samples, seed).reshape(2, -1, 3)[:, canvas.traced]
 
-    rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.seed + 2
+    rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.stream + 2
     strategy, traced_light = STRATEGIES[effort.strategy], light if canvas.film is not None else None
     for halves in refine(
         strategy, worlds, rays, effort.samples, effort.depth, seed, noisy, traced_light, start, progress
