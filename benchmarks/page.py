@@ -84,11 +84,11 @@ def number(value: float | None, digits: int = 1) -> str:
 def table(record: dict[str, Any]) -> list[str]:
     """Speed-ups by scene."""
     lines = [
-        "| scene | estimator alone / two renders | with region | with region and denoiser | estimator / Cycles "
-        "| with region and denoiser / Cycles |",
+        "| scene | estimator alone / two renders | with region | as delivered | estimator alone / Cycles "
+        "| as delivered / Cycles |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    keys = ("over_naive", "over_naive_region", "over_naive_denoised", "over_cycles", "over_cycles_denoised")
+    keys = ("over_naive_estimator", "over_naive_region", "over_naive", "over_cycles_estimator", "over_cycles")
     for name in SCENES:
         if name in record:
             lines.append(f"| {name} | " + " | ".join(number(record[name][f"speedup_{key}"]) for key in keys) + " |")

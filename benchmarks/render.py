@@ -90,7 +90,7 @@ def measure(scene: Scene, budget: Budget, threads: int, say: Any) -> dict[str, A
     result: dict[str, Any] = {
         f"speedup_over_{other}{ending}": speedup(curves[own][-1], curves[other]) if other in curves else None
         for other in ("naive", "cycles")
-        for own, ending in (("difference", ""), ("region", "_region"), ("insitu", "_denoised"))
+        for own, ending in (("difference", "_estimator"), ("region", "_region"), ("insitu", ""))
     }
     return (
         result

@@ -28,7 +28,7 @@ from pipeline.transport.caustics import Film
 from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
 from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.passes import Halves, Interrupted
-from pipeline.transport.region import limits_for
+from pipeline.transport.region import BLUR, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import object_shape
 from pipeline.transport.trace import Rays
@@ -36,6 +36,7 @@ from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
+BLURRED = 1 + 4 * BLUR**2  # interpolation errs by an eighth of second differences, the pilot's blur by 4 BLUR^2 more
 WORTH_A_RAY = 0.15  # of the irradiance: a weaker light is sampled with the sky, by its brightness
 Outcome = tuple[Raster, dict[str, Any], list[str]]  # layers, numbers, warnings
 
@@ -320,7 +321,7 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "term": "every pixel of the region",
             "modelled": f"{numbers['traced_fraction']:.1%} of the frame traced, the rest of the region interpolated",
             "because": "second differences of the pilot bound the error of interpolation",
-            "could_cost": f"{params.threshold / 2:.2%} of the plate, and the pilot's noise",
+            "could_cost": f"{BLURRED * params.threshold / 2:.2%} of the plate at most, and the pilot's noise",
         },
         {
             "term": "light tracing",

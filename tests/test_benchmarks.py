@@ -140,7 +140,7 @@ def test_layers_of_cycles_are_told_by_name() -> None:
 
 def test_page_without_cycles(tmp_path) -> None:
     point = {"error": 2.0, "cpu_s": 3.0, "samples": 4}
-    speedups = {f"speedup_over_{o}{e}": None for o in ("naive", "cycles") for e in ("", "_region", "_denoised")}
+    speedups = {f"speedup_over_{o}{e}": None for o in ("naive", "cycles") for e in ("", "_region", "_estimator")}
     scene = {
         "curves": {"naive": [point], "insitu": [point]},
         "cycles": None,
