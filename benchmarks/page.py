@@ -122,6 +122,8 @@ def write_page(record: dict[str, Any], folder: Path) -> None:
         *table(record),
         "",
     ]
+    if record.get("remark"):
+        lines += [record["remark"], ""]
     if not peers:
         lines += ["Cycles was left out: `make bench-cycles-env` installs it in an environment of its own.", ""]
     if "preview_cpu_s" in record:
