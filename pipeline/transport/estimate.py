@@ -33,7 +33,7 @@ from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples, Strategy, centre_albedo, reference_block, trace, unchanged_block
 
 STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
-PILOT_SHARE = 2  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
+PILOT_SHARE = 8  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
 MOST_PILOT = 512
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
@@ -124,7 +124,7 @@ def prepare(
         tell: gives a progress callback for a named task.
     """
     index, grid = cell_pixels(*shape)
-    samples = min(max(16, PILOT_SHARE * effort.samples), MOST_PILOT)
+    samples = min(max(64, PILOT_SHARE * effort.samples), MOST_PILOT)
     closed = worlds.convex and worlds.diffuse
     film = film if effort.strategy == "difference" and throws(worlds) else None
     if film is not None:
