@@ -148,14 +148,15 @@ def rendered(out: Path, **changes: Any) -> Raster:
     return render.compute(**inputs, **changes, params=draft("render")).outputs["layers"]
 
 
-def composed(photographs: dict[str, Raster], layers: Raster) -> Raster:
-    return composite.compute(photographs, layers, draft("composite")).outputs["composite"]
+def composed(out: Path, **changes: Any) -> Raster:
+    inputs = {name: value(out, artifact) for name, artifact in composite.STAGE.inputs.items() if name not in changes}
+    return composite.compute(**inputs, **changes, params=draft("composite")).outputs["composite"]
 
 
 def test_inserting_nothing_returns_the_plate_bit_for_bit(desk_build):
     photographs = value(desk_build, A.PHOTOGRAPHS)
     layers = rendered(desk_build, wishes={**value(desk_build, A.WISHES), "object": []})
-    result = composed(photographs, layers)
+    result = composed(desk_build, photographs=photographs, layers=layers)
     for name in "RGB":
         assert result[name].tobytes() == photographs["plate"][name].tobytes()
 
@@ -176,8 +177,10 @@ def test_twice_the_light_gives_twice_the_composite(desk_build):
     up to rounding: 1e-4 of the pixel, and of the picture's median where it is black.
     """
     photographs = {name: brighter(raster, 2) for name, raster in value(desk_build, A.PHOTOGRAPHS).items()}
-    layers = rendered(desk_build, environment=brighter(value(desk_build, A.ENVIRONMENT), 2))
-    once, twice = value(desk_build, A.COMPOSITE).rgb(), composed(photographs, layers).rgb()
+    light = brighter(value(desk_build, A.ENVIRONMENT), 2)
+    layers = rendered(desk_build, environment=light, photographs=photographs)
+    once = value(desk_build, A.COMPOSITE).rgb()
+    twice = composed(desk_build, photographs=photographs, layers=layers, environment=light).rgb()
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-4, atol=1e-4 * float(np.median(once)))
 
 
