@@ -9,7 +9,6 @@ from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_d
 from pipeline.light.environment import irradiance
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
-from pipeline.transport.reflectance import fill_unseen, reflected_radiance, updated_brdf
 from pipeline.transport.scene import Worlds, build_worlds, envmap_grid
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
@@ -238,22 +237,3 @@ def test_envmap_grid_keeps_a_constant_and_the_poles() -> None:
     grid = envmap_grid(ramp)
     assert grid.shape == (9, 16, 3)
     np.testing.assert_allclose(grid[1:-1, 0, 0], np.arange(7) + 0.5)  # rows of the corner grid lie between ours
-
-
-def test_equations_6_to_8() -> None:
-    light = np.array([2.0, 3, 4])
-    rho = np.array([0.1, 0.2, 0.05])
-    l_r1, l_r2 = reflected_radiance(rho, light), reflected_radiance(np.ones(3), light)
-    np.testing.assert_allclose(updated_brdf(l_r1, l_r2), rho)
-    assert np.isnan(updated_brdf(np.ones(3), np.zeros(3))).all()
-
-
-def test_fill_keeps_what_is_seen_and_stays_in_range() -> None:
-    rng = np.random.default_rng(1)
-    values = rng.uniform(0.2, 0.6, (33, 47, 3))
-    weight = (rng.uniform(size=(33, 47)) < 0.1).astype(float)
-    filled = fill_unseen(values, weight)
-    assert np.array_equal(filled[weight == 1], values[weight == 1])
-    assert filled.min() >= 0.2 - 1e-9
-    assert filled.max() <= 0.6 + 1e-9
-    assert np.all(fill_unseen(values, np.zeros_like(weight)) == 0)

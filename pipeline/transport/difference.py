@@ -25,7 +25,7 @@ import numpy as np
 
 from pipeline.transport.caustics import against_camera
 from pipeline.transport.directions import cone_pdf, cone_share, object_cones, sample_cone
-from pipeline.transport.paths import Caustic, trace_paths
+from pipeline.transport.paths import Caustic, distant, trace_paths
 from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples, camera_hits, collect, make_sampler
 
@@ -101,17 +101,14 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         meets = dr.any(weight != 0) & worlds.with_objects.ray_test(ray, dr.any(weight != 0))
         beta = dr.select(meets, weight, zero)
         return (
-            lost - hidden_light(worlds, hit, ray, beta, density, meets),
+            lost - hidden_light(worlds, ray, beta, density, meets),
             ray,
             beta,
             mi.Bool(False),
             dr.select(meets, density, 0.0),
         )
 
-    def onward(state: tuple[Any, ...]) -> Any:
-        return state[0]
-
-    def bounce(state: tuple[Any, ...]) -> tuple[Any, ...]:
+    def bounce(*state: Any) -> tuple[Any, ...]:
         active, point, through, left, lost, split, beta, behind, drawn, sampler = state
         taken, ray, weight, density = step(worlds, sampler, point, active)
         lost += dr.select(active, through * taken, zero)
@@ -120,7 +117,7 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         local = worlds.is_local(following)
         meets = following.is_valid() & ~local
         covered = meets & worlds.without_objects.ray_test(ray, meets)
-        lost -= hidden_light(worlds, point, ray, dr.select(meets & ~covered, weight, zero), density, meets & ~covered)
+        lost -= hidden_light(worlds, ray, dr.select(meets & ~covered, weight, zero), density, meets & ~covered)
         split = dr.select(meets, ray, split)
         beta = dr.select(meets, weight, beta)
         behind |= covered
@@ -140,7 +137,7 @@ def follow(worlds: Worlds, sampler: Any, hit: Any, active: Any, depth: int) -> t
         dr.zeros(mi.Float, width),
         sampler,
     )
-    state = dr.while_loop(state, lambda *s: onward(s), lambda *s: bounce(s), label="difference path")
+    state = dr.while_loop(state, lambda *s: s[0], bounce, label="difference path")
     return state[4:9]
 
 
@@ -181,20 +178,11 @@ def step(worlds: Worlds, sampler: Any, hit: Any, active: Any) -> tuple[Any, Any,
     return lost, mi.Ray3f(origin, toward), dr.select(usable, value / density, mi.Color3f(0.0)), density
 
 
-def hidden_light(worlds: Worlds, hit: Any, ray: Any, weight: Any, density: Any, active: Any) -> Any:
+def hidden_light(worlds: Worlds, ray: Any, weight: Any, density: Any, active: Any) -> Any:
     """Distant light that a direction no longer receives; what of it `step` finds by sampling the light is left out."""
     import drjit as dr
 
     mi = worlds.mi
-    total = mi.Color3f(0.0)
-    for group in worlds.lights_above:
-        if group.compact:
-            continue
-        emitter = group.scene.environment()
-        away = dr.zeros(mi.SurfaceInteraction3f)
-        away.wi = -ray.d
-        record = dr.zeros(mi.DirectionSample3f)
-        record.d = ray.d
-        pdf = emitter.pdf_direction(hit, record, active)  # the only light of that scene
-        total += emitter.eval(away, active) * (density / (density + pdf))
-    return dr.select(active, weight * total, mi.Color3f(0.0))
+    wide = [group for group in worlds.lights_above if not group.compact]
+    light = distant(worlds, wide, ray.d, active, density, mi.Bool(False), mi.Bool(False))
+    return dr.select(active, weight * light, mi.Color3f(0.0))

@@ -20,6 +20,7 @@ from pipeline.transport.denoise import (
     Half,
     QuietChange,
     bounding_window,
+    continued,
     denoise,
     glimpsed,
     needs_more,
@@ -182,18 +183,14 @@ def received(
     progress: Callable[[float], None] = lambda share: None,
 ) -> np.ndarray:
     """(H W, 3) irradiance that explains LS_noobj of a rectangle of pixels, path traced and smoothed."""
-    from scipy.ndimage import distance_transform_edt
-
     traced = trace(
         unchanged_block, worlds, rays, samples, effort.depth + 1, effort.stream + 90_001, footprint_px, progress
     )
-    known = (traced.albedo > 0).all(1).reshape(shape)
+    known = np.asarray((traced.albedo > 0).all(1)).reshape(shape)
     if not known.any():
         return np.zeros((len(rays), 3))
     light = np.divide(traced.without * np.pi, traced.albedo, out=np.zeros_like(traced.albedo), where=traced.albedo > 0)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    image = light.reshape(*shape, 3)[tuple(nearest)]
-    guide = traced.albedo.reshape(*shape, 3)[tuple(nearest)]
+    image, guide = (continued(part.reshape(*shape, 3), known) for part in (light, traced.albedo))
     return denoise(image, guide)[0].reshape(-1, 3) if effort.denoise else image.reshape(-1, 3)
 
 

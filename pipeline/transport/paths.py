@@ -62,7 +62,7 @@ def trace_paths(
             left = (mirrors & ~(caustic.seen & (length == 1))) | (caustic.active & (length == 1))
         apart = (length <= 1) | mirrors
         for groups, here in ((worlds.lights, escaped & apart), ((worlds.whole,), escaped & ~apart)):
-            found += dr.select(here, through * _distant(worlds, groups, ray.d, here, density, delta, left), 0.0)
+            found += dr.select(here, through * distant(worlds, groups, ray.d, here, density, delta, left), 0.0)
         given = active & hit.is_valid()
         for lamp in lamps:
             alone = delta if lamp in aimed else mi.Bool(True)
@@ -112,7 +112,7 @@ def trace_paths(
     return dr.while_loop(state, lambda *s: s[0], functools.partial(vertex, (worlds.whole,)), label="path")[3]
 
 
-def _distant(
+def distant(
     worlds: Worlds, groups: Sequence[LightGroup], direction: Any, active: Any, density: Any, delta: Any, left: Any
 ) -> Any:
     """Light of the groups that a direction, drawn with ``density``, finds; ``left``: not that of the emitters."""
