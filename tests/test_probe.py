@@ -10,9 +10,11 @@ import pytest
 from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
-from pipeline.light import mirror_ball, sphere_fit
-from pipeline.light.combine import ViewMap, fill, merge, relative_exposure, toward_photographer
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
+from pipeline.probes import reflection, sphere_fit
+from pipeline.probes.combine import fill, merge, relative_exposure, toward_photographer
+from pipeline.probes.observation import ViewMap
+from pipeline.probes.unwrap import samples_per_axis, unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
 from stages import knobs, probe
@@ -45,7 +47,12 @@ def view(world_from_camera: np.ndarray) -> View:
 def facts(*balls: tuple[str, bool]) -> dict[str, Any]:
     return {
         "ball": [{"name": name, "tripod": tripod} for name, tripod in balls],
-        "probe": {"diameter_m": 2 * RADIUS, "reflectance": (0.8, 0.8, 0.8), "reflectance_space": "acescg"},
+        "probe": {
+            "kind": "mirror_ball",
+            "diameter_m": 2 * RADIUS,
+            "reflectance": (0.8, 0.8, 0.8),
+            "reflectance_space": "acescg",
+        },
     }
 
 
@@ -61,14 +68,14 @@ def truth_map(place: Place, height: int, width: int, split: int = 4) -> np.ndarr
 @pytest.mark.parametrize("ratio", [1e-6, 0.05, 0.3, 0.9])
 def test_incidence_inverts_deviation(ratio):
     sine = np.linspace(0, 1, 500)
-    again = np.sin(mirror_ball.incidence(mirror_ball.deviation(sine, ratio), ratio))
+    again = np.sin(reflection.incidence(reflection.deviation(sine, ratio), ratio))
     assert again == pytest.approx(sine, abs=1e-9)
 
 
 def test_far_away_is_debevecs_formula_and_blind_cone_is_the_limit():
     sine = np.linspace(0, 1, 100)
-    assert mirror_ball.deviation(sine, 1e-9) == pytest.approx(2 * np.arcsin(sine), abs=1e-8)
-    assert np.pi - mirror_ball.deviation(1.0, 0.3) == pytest.approx(mirror_ball.blind_half_angle(0.3), abs=1e-12)
+    assert reflection.deviation(sine, 1e-9) == pytest.approx(2 * np.arcsin(sine), abs=1e-8)
+    assert np.pi - reflection.deviation(1.0, 0.3) == pytest.approx(reflection.blind_half_angle(0.3), abs=1e-12)
 
 
 def test_reflected_rays_come_back():
@@ -76,18 +83,18 @@ def test_reflected_rays_come_back():
     w /= np.linalg.norm(w, axis=1, keepdims=True)
     centre = np.array([0.05, 0.1, 0.3])
     distance = np.linalg.norm(centre)
-    rays, sine = mirror_ball.rays_from_directions(w, -centre / distance, RADIUS / distance)
+    rays, sine = reflection.rays_from_directions(w, -centre / distance, RADIUS / distance)
     seen = ~np.isnan(sine)
-    blind = w @ (centre / distance) > np.cos(mirror_ball.blind_half_angle(RADIUS / distance))
+    blind = w @ (centre / distance) > np.cos(reflection.blind_half_angle(RADIUS / distance))
     assert (seen == ~blind).all()
-    assert mirror_ball.directions_from_rays(rays[seen], centre, RADIUS) == pytest.approx(w[seen], abs=1e-9)
+    assert reflection.directions_from_rays(rays[seen], centre, RADIUS) == pytest.approx(w[seen], abs=1e-9)
 
 
 def test_radians_per_pixel_is_the_derivative():
     ratio, step = 0.2, 1e-6
     sine = np.array([0.0, 0.3, 0.9])
-    radial, _ = mirror_ball.radians_per_pixel(sine, ratio, 100)
-    numeric = (mirror_ball.deviation(sine + step, ratio) - mirror_ball.deviation(sine, ratio)) / (100 * step)
+    radial, _ = reflection.radians_per_pixel(sine, ratio, 100)
+    numeric = (reflection.deviation(sine + step, ratio) - reflection.deviation(sine, ratio)) / (100 * step)
     assert radial == pytest.approx(numeric, rel=1e-4)
 
 
@@ -98,8 +105,8 @@ def unwrapped(place: Place, camera: Camera, pose: np.ndarray, height: int = 64, 
     picture = photograph(place, camera, pose, split)
     centre = transform_points(invert_rigid(pose), np.array(place.ball))
     size = sphere_fit.radius_in_pixels(camera, centre, RADIUS)
-    count = mirror_ball.samples_per_axis(2 * height, size, count)
-    return mirror_ball.unwrap(picture, camera, pose, centre, RADIUS, height, 2 * height, count, 0.97)
+    count = samples_per_axis(2 * height, size, count)
+    return unwrap(picture, camera, pose, centre, RADIUS, height, 2 * height, count, 0.97)
 
 
 @pytest.mark.parametrize("name", ["+x", "-x", "+y", "-y", "+z", "-z"])
@@ -191,7 +198,7 @@ def direction_rms_deg(fitted: np.ndarray, true: np.ndarray) -> float:
     rays = np.sqrt(1 - sine**2)[:, None] * axis + sine[:, None] * (
         np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     )
-    two = [mirror_ball.directions_from_rays(rays, centre, RADIUS) for centre in (fitted, true)]
+    two = [reflection.directions_from_rays(rays, centre, RADIUS) for centre in (fitted, true)]
     error = np.arccos(np.clip((two[0] * two[1]).sum(1), -1, 1))
     return float(np.degrees(np.sqrt(np.mean(error**2))))
 

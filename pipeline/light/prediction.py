@@ -18,8 +18,8 @@ from pipeline.conventions import (
 )
 from pipeline.image.metrics import box
 from pipeline.light.environment import resize_environment
-from pipeline.light.mirror_ball import directions_from_rays
 from pipeline.light.sampling import bilinear, planes
+from pipeline.probes.reflection import directions_from_rays
 from pipeline.types import BallFit, Camera, Plane
 
 SHADOW_MAP = (64, 128)  # texels of the light that casts the ball's shadow: 2.8 deg, the ball is 20 deg and more

@@ -6,14 +6,13 @@ weighting by it would prefer whichever view is darker wherever two views disagre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
+from pipeline.probes.observation import ViewMap
 from pipeline.types import Camera
 
 MOVED_PHOTOGRAPHER_WEIGHT = 1e-3  # another view wins wherever it sees; alone, the view still answers
@@ -21,16 +20,6 @@ BODY_RADIUS_M, COLUMN_AZIMUTH, COLUMN_ABOVE, COLUMN_FOOT = 0.12, np.radians(16.0
 TEXTURE_SCALE = 0.02  # rad: finer displacements than this cost nothing; sets how steep the weights are
 CELL_ROWS = 16  # rows of the coarse grid on which views are compared: cells of 11 degrees
 SIGNIFICANT = 3.0  # standard deviations
-
-
-@dataclass(frozen=True)
-class ViewMap:
-    """One view on the grid: radiance and variance (H, W, 3), weight (H, W), coverage (H, W) in [0, 1]."""
-
-    rgb: np.ndarray
-    variance: np.ndarray
-    weight: np.ndarray
-    coverage: np.ndarray
 
 
 def toward_photographer(height: int, width: int, to_camera: np.ndarray, distance: float) -> np.ndarray:

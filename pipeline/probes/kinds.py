@@ -1,0 +1,8 @@
+"""The probe kinds, by their name in capture.toml: ``[probe] kind``."""
+
+from __future__ import annotations
+
+from pipeline.probes.mirror_ball import MirrorBall
+from pipeline.probes.observation import Kind
+
+KINDS: dict[str, Kind] = {"mirror_ball": MirrorBall()}

@@ -1,0 +1,226 @@
+"""The mirror ball: found on the plane, fitted as a sphere under the lens, unwrapped by exact perspective reflection.
+
+Radiance is the pixel's over the ball's reflectance, as mirrors conserve radiance (Debevec 1998). The tripod's own
+photographer stays, as he stood there for the plate too; those of moved views give way to what other views see.
+Limits: light is taken as distant, so things at distance d are displaced by up to R/d; no Fresnel, dirt or dents.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.conventions import CLIPPED, latlong_solid_angles
+from pipeline.image.colour import Space, convert
+from pipeline.probes import combine, sphere_fit
+from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
+from pipeline.probes.observation import Grid, Observation, Shots, ViewMap, lookup_channels
+from pipeline.probes.reflection import blind_half_angle, radians_per_pixel
+from pipeline.probes.unwrap import samples_per_axis, unwrap
+from pipeline.types import BallFit, Camera, Raster, View
+
+PIXEL_SIGMA = 0.5  # px: half-width of pixel and lookup, for the angular resolution of a texel
+
+
+class MirrorBall:
+    """One or several photographs of a polished ball that stands on the plane."""
+
+    def observe(self, shots: Shots, grid: Grid) -> Observation:
+        """One map per ball view. Raises CaptureError when there is no ball, or it cannot be used."""
+        facts, photographs, camera, views = shots.facts, shots.photographs, shots.camera, shots.views
+        radius = 0.5 * float(facts["probe"]["diameter_m"])
+        names = [ball["name"] for ball in sorted(facts["ball"], key=lambda ball: not ball.get("tripod", False))]
+        tripod = {ball["name"] for ball in facts["ball"] if ball.get("tripod", False)}
+        warnings: list[str] = []
+        found: dict[str, Found] = {}
+        for name in names:
+            plate = photographs["plate"] if name in tripod else None
+            near = [ball.centre_world for ball in found.values()]
+            found[name] = find_ball(name, photographs[name], plate, camera, views[name], radius, near)
+            warnings += complaints(name, found[name], radius)
+        space: Space = "linear_rec709" if facts["probe"].get("reflectance_space") == "linear_rec709" else "acescg"
+        reflectance = convert(np.array(facts["probe"]["reflectance"], float), space, "acescg")
+        level = plate_level(photographs, camera, found, tripod, radius)
+        if level != 1:
+            warnings.append(f"the ball's photographs are {level:.4f} times as bright as the plate; brought to it")
+        maps = {
+            name: view_map(photographs[name], camera, views[name], found[name], radius, reflectance, grid).scaled(
+                1 / level
+            )
+            for name in names
+        }
+        shade_photographers(maps, found, views, tripod)
+        numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) for name in names}
+        numbers["ball_over_plate_exposure"] = level
+        balls = {name: ball_record(found[name].fit, radius) for name in (ball["name"] for ball in facts["ball"])}
+        centre = np.mean([ball.centre_world for ball in found.values()], 0)
+        return Observation(maps, centre, balls, numbers, warnings, reasons(found, tripod))
+
+
+def view_map(
+    photograph: Raster, camera: Camera, view: View, ball: Found, radius: float, reflectance: np.ndarray,
+    grid: Grid,
+) -> ViewMap:  # fmt: skip
+    """One view on the lat-long grid, with its weights."""
+    height, width = grid.height, grid.width
+    fit, ratio = ball.fit, radius / float(np.linalg.norm(ball.fit.centre))
+    window, part = crop(camera, fit, radius)
+    picture = lookup_channels(photograph, window)
+    count = samples_per_axis(width, fit.radius_px, grid.supersample)
+    unwrapped = unwrap(picture, part, view.world_from_camera, fit.centre, radius, height, width, count, grid.rim)
+    valid = unwrapped.values[..., 6]
+    coverage = unwrapped.coverage * valid
+    safe = np.where(valid > 0, valid, 1)[..., None]
+    rgb = unwrapped.values[..., :3] / safe / reflectance
+    photon = unwrapped.values[..., 3:6] / safe / reflectance**2
+    sine = np.minimum(unwrapped.sine, 0.999)
+    sigma, per_pixel = angular_sigma(sine, fit, ratio, view)
+    pixels = latlong_solid_angles(height, width) / np.where(np.isfinite(per_pixel), per_pixel, np.inf)
+    gradient = combine.gradient_per_radian(rgb)
+    displaced = (gradient * np.where(np.isfinite(sigma), sigma, 0)[..., None]) ** 2
+    variance = photon / np.maximum(pixels, 1)[..., None] + displaced
+    blur = PIXEL_SIGMA * np.sqrt(per_pixel)
+    weight = combine.angular_weight(sine, np.hypot(sigma, blur), grid.rim) * coverage
+    share = unwrapped.values[..., 7] / safe[..., 0] * (coverage > 0)
+    return ViewMap(rgb, variance, weight / (1 + 100 * share), coverage, share)
+
+
+def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tuple[slice, slice], Camera]:
+    """Rows and columns of the ball, and the camera whose picture they are."""
+    px = sphere_fit.silhouette(camera, fit.centre, radius, 2 * np.pi * np.arange(180) / 180)[0]
+    low = np.clip(np.floor(px.min(0)).astype(int) - 3, 0, (camera.width - 1, camera.height - 1))
+    high = np.clip(np.ceil(px.max(0)).astype(int) + 3, low + 1, (camera.width, camera.height))
+    size = high - low
+    moved = {
+        "cx": camera.cx - int(low[0]),
+        "cy": camera.cy - int(low[1]),
+        "width": int(size[0]),
+        "height": int(size[1]),
+    }
+    return (slice(low[1], high[1]), slice(low[0], high[0])), camera.model_copy(update=moved)
+
+
+def angular_sigma(
+    sine: np.ndarray, fit: sphere_fit.SphereFit, ratio: float, view: View
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard uncertainty [rad] of each texel's direction, and the solid angle of one pixel there; NaN where blind.
+
+    The centre's covariance is split into a shift across the ray and a change of size; the pose's rotation is added.
+    """
+    radial, across = radians_per_pixel(sine, ratio, fit.radius_px)
+    axis = fit.centre / np.linalg.norm(fit.centre)
+    pixels_per_metre = fit.radius_px * ratio / np.sin(np.arcsin(ratio)) / (ratio * np.linalg.norm(fit.centre))
+    along = float(axis @ fit.covariance @ axis)
+    sideways = max(float(np.trace(fit.covariance)) - along, 0.0) / 2
+    shift = sideways * pixels_per_metre**2
+    growth = along * (fit.radius_px / np.linalg.norm(fit.centre)) ** 2
+    turn = float(np.trace(view.covariance[:3, :3])) / 3
+    return np.sqrt(radial**2 * (shift + sine**2 * growth) + across**2 * shift + 2 * turn), radial * across
+
+
+def plate_level(
+    photographs: dict[str, Raster], camera: Camera, found: dict[str, Found], tripod: set[str], radius: float
+) -> float:
+    """How much brighter the tripod's ball photograph is than the plate, away from the ball and its shadow.
+
+    Labels of exposure are wrong by percents; from one place the same table is the same light. Median over pixels more
+    than three ball radii from the ball that are known to 10 % in both; 1 without a tripod view or below 0.2 %.
+    """
+    for name in sorted(tripod & set(found)):
+        one, plate = photographs[name], photographs["plate"]
+        if one.shape != plate.shape:
+            continue
+        px = sphere_fit.silhouette(camera, found[name].fit.centre, radius, 2 * np.pi * np.arange(60) / 60)[0]
+        y, x = np.mgrid[: one.shape[0], : one.shape[1]]
+        far = np.hypot(x - px[:, 0].mean(), y - px[:, 1].mean()) > 3 * found[name].fit.radius_px
+        with np.errstate(invalid="ignore"):
+            good = far & (one["mask"] & CLIPPED == 0) & (plate["mask"] & CLIPPED == 0) & (plate["G"] > 0)
+            good &= np.hypot(np.sqrt(one["variance.G"]), np.sqrt(plate["variance.G"])) < 0.1 * plate["G"]
+        if good.sum() > 1000:
+            ratio = float(np.median(one["G"][good] / plate["G"][good]))
+            return ratio if abs(ratio - 1) > 2e-3 else 1.0
+    return 1.0
+
+
+def shade_photographers(
+    maps: dict[str, ViewMap], found: dict[str, Found], views: dict[str, View], tripod: set[str]
+) -> None:
+    """Lower the weight of moved views where their own camera and photographer stand, and where the tripod's stood.
+
+    The tripod's photographer was there for the plate and lights it: only the tripod's views show him.
+    """
+    hidden = {}
+    for name, view in maps.items():
+        to_camera = views[name].world_from_camera[:3, 3] - found[name].centre_world
+        distance = float(np.linalg.norm(to_camera))
+        height, width = view.weight.shape
+        hidden[name] = combine.toward_photographer(height, width, to_camera / distance, distance)
+    for name in set(maps) - tripod if len(maps) > 1 else ():
+        view = maps[name]
+        shade = np.max([hidden[other] for other in {name} | (tripod & set(maps))], 0)
+        lowered = view.weight * (1 - (1 - combine.MOVED_PHOTOGRAPHER_WEIGHT) * shade)
+        maps[name] = ViewMap(view.rgb, view.variance, lowered, view.coverage, view.clipped)
+
+
+def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
+    """Figures of one fitted ball."""
+    fit, distance = ball.fit, float(np.linalg.norm(ball.fit.centre))
+    gap, gap_sigma = discrepancy(ball, radius)
+    return {
+        "centre_world_m": ball.centre_world.tolist(),
+        "centre_sigma_mm": (1e3 * np.sqrt(np.diag(fit.covariance))).tolist(),
+        "rms_px": fit.rms_px, "points": fit.points, "radius_px": fit.radius_px,
+        "distance_over_radius": distance / radius,
+        "rim_inset_px": fit.inset_px, "outline_support": fit.support, "outline_contrast": fit.contrast,
+        "outline_in_frame": fit.visible, "height_discrepancy_mm": 1e3 * gap,
+        "height_discrepancy_sigma_mm": 1e3 * gap_sigma,
+        "blind_half_angle_deg": float(np.degrees(blind_half_angle(radius / distance))),
+    }  # fmt: skip
+
+
+def ball_record(fit: sphere_fit.SphereFit, radius: float) -> BallFit:
+    """The fit as it is stored."""
+    return BallFit(
+        centre_camera_m=fit.centre, radius_m=radius, covariance=fit.covariance, rms_px=fit.rms_px, points=fit.points,
+        radius_px=fit.radius_px,
+    )  # fmt: skip
+
+
+def reasons(found: dict[str, Found], tripod: set[str]) -> list[dict[str, Any]]:
+    """Which terms of the model are in, and why."""
+    moved = [name for name in found if name not in tripod]
+    height = 1e3 * max(ball.height.sigma_m for ball in found.values())
+    rim = 1e3 * max(float(np.sqrt(b.height.normal @ b.free.covariance @ b.height.normal)) for b in found.values())
+    return [
+        {
+            "term": "ball stands on the plane",
+            "modelled": True,
+            "because": f"pose and contact give the height to {height:.1f} mm, the rim alone to {rim:.1f} mm",
+            "could_cost": "the distance from the rim alone: about 1 px of radius",
+        },
+        {
+            "term": "moved photographer removed, the tripod's kept",
+            "modelled": len(found) > 1 and bool(moved),
+            "because": "who moved was not there for the plate; who stood at the tripod was, and lights it",
+            "could_cost": "one person's solid angle of wrong light",
+        },
+        {
+            "term": "Fresnel reflectance of the ball",
+            "modelled": False,
+            "because": "the manifest gives one reflectance per channel",
+            "could_cost": "1 to 3 % near the rim of chrome, 0 of an ideal mirror",
+        },
+        {
+            "term": "parallax of near surfaces",
+            "modelled": False,
+            "because": "the room's distances are not measured",
+            "could_cost": "directions off by R over distance, radiance unbiased",
+        },
+        {
+            "term": "photon noise in the view weights",
+            "modelled": False,
+            "because": "it follows the signal; views are weighted by how well they know the direction",
+            "could_cost": "less than the bias it would bring to lamps",
+        },
+    ]

@@ -1,0 +1,102 @@
+"""The contract of all probe kinds: what they may look at, and what they return.
+
+A kind is a class with one method, ``observe(shots, grid) -> Observation``, registered in `pipeline.probes.kinds`. It
+turns photographs into one lat-long map per view, world frame, ACEScg radiance in the plate's unit, with a variance, and
+says what it does not see. The stage `probe` knows no kind: it levels views, merges, fills, and writes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from pipeline.conventions import CLIPPED
+from pipeline.types import BallFit, Camera, Raster, View
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Everything a kind may look at: validated facts, developed photographs, the lens and the poses of the views."""
+
+    facts: dict[str, Any]
+    photographs: dict[str, Raster]
+    camera: Camera
+    views: dict[str, View]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The map that is asked for: ``width`` texels around, half as many down.
+
+    ``supersample``: least lookups per texel and axis; ``rim``: outermost radius of a ball that is used, as a fraction.
+    """
+
+    width: int
+    supersample: int = 3
+    rim: float = 0.97
+
+    @property
+    def height(self) -> int:
+        """Texels from pole to pole."""
+        return self.width // 2
+
+
+@dataclass(frozen=True)
+class ViewMap:
+    """One view on the grid, world frame.
+
+    Radiance and variance (H, W, 3); weight (H, W), any unit; coverage (H, W) in [0, 1], how much of a texel was seen;
+    ``clipped`` (H, W) in [0, 1], how much of what was seen is clipped in every frame; zeros when not given.
+    """
+
+    rgb: np.ndarray
+    variance: np.ndarray
+    weight: np.ndarray
+    coverage: np.ndarray
+    clipped: np.ndarray | float = 0.0
+
+    def scaled(self, factor: float | np.ndarray) -> ViewMap:
+        """The same view at ``factor`` times the exposure, a number or one per channel."""
+        return ViewMap(self.rgb * factor, self.variance * np.square(factor), self.weight, self.coverage, self.clipped)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a kind saw.
+
+    ``maps``: view name -> map, the view to which others are levelled first; ``centre_world`` (3,): where the light was
+    measured; ``balls``: fitted balls by view, empty for other kinds; ``numbers`` by view or name, ``warnings`` and
+    ``evidence`` as in `Result`.
+    """
+
+    maps: dict[str, ViewMap]
+    centre_world: np.ndarray
+    balls: dict[str, BallFit] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    evidence: list[dict[str, Any]] = field(default_factory=list)
+
+
+class Kind(Protocol):
+    """A probe kind. Raises CaptureError when its photographs cannot be used."""
+
+    def observe(self, shots: Shots, grid: Grid) -> Observation:
+        """Maps of every view."""
+        ...
+
+
+def lookup_channels(photograph: Raster, window: tuple[slice, slice] = (slice(None), slice(None))) -> np.ndarray:
+    """(H, W, 8): RGB, variance RGB, valid, clipped, of a part of a photograph; invalid pixels are zero.
+
+    A clipped pixel's infinite variance becomes the square of its value: 100 %.
+    """
+    rgb = photograph.rgb()[window]
+    variance = photograph.rgb("variance")[window]
+    clipped = photograph["mask"][window] & CLIPPED > 0
+    valid = np.isfinite(rgb).all(-1)
+    rgb = np.where(valid[..., None], rgb, 0)
+    variance = np.where(np.isfinite(variance) & valid[..., None], variance, rgb**2)
+    flags = np.stack([valid, clipped & valid], -1)
+    return np.concatenate([rgb, variance, flags], -1).astype(np.float32)
