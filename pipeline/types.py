@@ -178,6 +178,18 @@ class Occluder(Record):
     mask_sha256: str = ""
 
 
+class Harmonics(Record):
+    """Nine real spherical harmonics of the environment's *radiance*, and what turns them into irradiance."""
+
+    quantity: Literal["radiance"] = "radiance"
+    basis: str = "real, orthonormal on the sphere: 1, y, z, x, xy, yz, 3zz-1, xz, xx-yy of the unit direction"
+    sign: str = "no Condon-Shortley phase: the coefficient of y is positive when light comes from +y"
+    frame: Literal["world"] = "world"
+    coefficients: Array  # (9, 3), ACEScg, radiance unit times steradian
+    sigma: Array  # (9, 3), standard uncertainty, texels taken as independent
+    irradiance_factors: Array  # (9,): irradiance at normal n is sum_i factor_i coefficient_i basis_i(n)
+
+
 class Emitter(Record):
     """A compact light: an exact set of texels of the environment. What no emitter holds is the sky."""
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
-from pipeline.light.harmonics import sh9_irradiance, sh9_of_environment
+from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import combine
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
-from pipeline.run.artifacts import BALLS, CAMERA, ENVIRONMENT, FACTS, PHOTOGRAPHS, VIEWS
+from pipeline.run.artifacts import BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Raster, Result, View
+from pipeline.types import Camera, Harmonics, Raster, Result, View
 from stages import knobs
 
 
@@ -49,9 +49,12 @@ def compute(
             "seen": seen.astype(np.float32),
         },
         ACESCG,
-        {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world"},
+        {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"},
     )
-    outputs = {"balls": observed.balls, "environment": environment}
+    harmonics = Harmonics(
+        coefficients=sh9_of_environment(rgb), sigma=sh9_sigma(variance), irradiance_factors=COSINE_LOBE
+    )
+    outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
     return Result(outputs, numbers, warnings, [*observed.evidence, *reasons(applied)])
 
 
@@ -122,5 +125,5 @@ def reasons(applied: list[str]) -> list[dict[str, Any]]:
 STAGE = Stage(
     "probe", compute, knobs.Probe,
     inputs={"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS},
-    outputs={"balls": BALLS, "environment": ENVIRONMENT},
+    outputs={"balls": BALLS, "environment": ENVIRONMENT, "harmonics": HARMONICS},
 )  # fmt: skip

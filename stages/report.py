@@ -16,7 +16,7 @@ from pipeline.image import page, pictures
 from pipeline.image.panels import PARTS, TARGETS, Build, ball_rows, checks, light_of
 from pipeline.run import artifacts as A
 from pipeline.run.stage import Stage
-from pipeline.types import BallFit, Bracket, Camera, Plane, Raster, Result, View
+from pipeline.types import BallFit, Bracket, Camera, Harmonics, Plane, Raster, Result, View
 from stages import knobs
 
 HERO = 1600  # px at most, about, of the picture on top
@@ -47,14 +47,14 @@ COLOURS = ["#4c78a8", "#72b7b2", "#54a24b", "#eeca3b", "#f58518", "#e45756", "#b
 def compute(
     facts: dict[str, Any], wishes: dict[str, Any], brackets: dict[str, Bracket],
     exposures: dict[str, list[dict[str, Any]]], photographs: dict[str, Raster], camera: Camera, views: dict[str, View],
-    balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster, layers: Raster, composite: Raster,
-    display: np.ndarray, plate_display: np.ndarray, metrics: dict[str, Any], selfcheck: dict[str, Any],
-    error_map: Raster, records: dict[str, Any], params: knobs.Report,
+    balls: dict[str, BallFit], environment: Raster, harmonics: Harmonics, plane: Plane, albedo: Raster, layers: Raster,
+    composite: Raster, display: np.ndarray, plate_display: np.ndarray, metrics: dict[str, Any],
+    selfcheck: dict[str, Any], error_map: Raster, records: dict[str, Any], params: knobs.Report,
 ) -> Result:  # fmt: skip
     """The page as text."""
     build = Build(
-        facts, wishes, brackets, exposures, photographs, camera, views, balls, environment, plane, albedo, layers,
-        composite, display, plate_display, metrics, selfcheck, error_map, records,
+        facts, wishes, brackets, exposures, photographs, camera, views, balls, environment, harmonics, plane, albedo,
+        layers, composite, display, plate_display, metrics, selfcheck, error_map, records,
     )  # fmt: skip
     sections = [section(build, name) for name in TITLES if name in records]
     names = [wish["name"] for wish in wishes.get("object", [])]
@@ -165,9 +165,9 @@ STAGE = Stage(
     inputs={
         "facts": A.FACTS, "wishes": A.WISHES, "brackets": A.BRACKETS, "exposures": A.EXPOSURES,
         "photographs": A.PHOTOGRAPHS, "camera": A.CAMERA, "views": A.VIEWS, "balls": A.BALLS,
-        "environment": A.ENVIRONMENT, "plane": A.PLANE, "albedo": A.ALBEDO, "layers": A.LAYERS,
-        "composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY, "metrics": A.METRICS,
-        "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "records": A.RECORDS,
+        "environment": A.ENVIRONMENT, "harmonics": A.HARMONICS, "plane": A.PLANE, "albedo": A.ALBEDO,
+        "layers": A.LAYERS, "composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY,
+        "metrics": A.METRICS, "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "records": A.RECORDS,
     },
     outputs={"report": A.REPORT},
 )  # fmt: skip

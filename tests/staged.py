@@ -9,8 +9,9 @@ import numpy as np
 
 from pipeline.conventions import invert_rigid, latlong_directions, transform_points
 from pipeline.light import prediction
+from pipeline.light.harmonics import COSINE_LOBE, sh9_of_environment
 from pipeline.run import formats
-from pipeline.types import BallFit, Camera, Plane, Raster, View
+from pipeline.types import BallFit, Camera, Harmonics, Plane, Raster, View
 
 WIDTH, HEIGHT, FOCAL = 192, 128, 200.0
 RADIUS, ALBEDO = 0.04, 0.5
@@ -61,6 +62,9 @@ def artifacts() -> dict[str, Any]:
     light = sky()
     found: dict[str, Any] = {"camera": camera, "views": views, "balls": balls, "plane": plane}
     found["environment"] = acescg(light, seen=np.ones(light.shape[:2]), layers={"variance": 0 * light})
+    found["harmonics"] = Harmonics(
+        coefficients=sh9_of_environment(light), sigma=np.zeros((9, 3)), irradiance_factors=COSINE_LOBE
+    )
     found["albedo"] = acescg(np.full((32, 32, 3), ALBEDO), seen=np.ones((32, 32)))
     photographs = {"plate": acescg(np.full((HEIGHT, WIDTH, 3), 0.2), mask=np.zeros((HEIGHT, WIDTH)))}
     for name, ball in balls.items():

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
-from pipeline.light.harmonics import sh9_basis, sh9_irradiance, sh9_of_environment
+from pipeline.light.harmonics import sh9_basis, sh9_irradiance, sh9_of_environment, sh9_sigma
 
 TILTED = np.array([[0.3, 0.8, -0.52], [-0.11, 0.02, 0.99], [0.7, -0.7, 0.1]])
 NORMALS = np.concatenate([AXES, TILTED / np.linalg.norm(TILTED, axis=1, keepdims=True)])
@@ -82,3 +82,10 @@ def test_harmonic_irradiance_is_exact_for_light_of_second_order():
     coefficients = np.random.default_rng(1).normal(size=(9, 3))
     rgb = sh9_basis(latlong_directions(256, 512)) @ coefficients
     assert sh9_irradiance(coefficients, NORMALS) == pytest.approx(irradiance(rgb, NORMALS), abs=1e-3)
+
+
+def test_uncertainty_of_the_harmonics_is_their_scatter():
+    rng, sigma = np.random.default_rng(3), 0.1 + np.abs(latlong_directions(16, 32)[..., :1])
+    found = [sh9_of_environment(sigma * rng.standard_normal((16, 32, 1))) for _ in range(2000)]
+    # The scatter of 2000 normal draws is known to 1 / sqrt(4000) = 1.6 %; four of those.
+    assert sh9_sigma(sigma**2) == pytest.approx(np.std(found, 0), rel=0.064)

@@ -76,6 +76,16 @@ def test_trap_1_openexr_writes_wrong_pixels_of_views(name, tmp_path):
     assert back["flags"].dtype == np.uint32
 
 
+def test_maps_say_that_they_are_latlong(tmp_path):
+    import OpenEXR
+
+    path = tmp_path / "map.exr"
+    write_exr(path, Raster(Raster.split(np.ones((4, 8, 3), np.float32)), "acescg", {"envmap": "latlong"}))
+    assert read_exr(path).attributes["envmap"] == "latlong"
+    with OpenEXR.File(str(path)) as file:
+        assert file.header()["envmap"] == OpenEXR.ENVMAP_LATLONG
+
+
 def test_trap_1_one_place_writes_exr():
     assert mentions("OpenEXR", "scanlineimage") - {"pipeline/run/runner.py"} == {
         "pipeline/run/formats.py"

@@ -13,11 +13,12 @@ from pipeline.image import figures as fig
 from pipeline.image import pictures
 from pipeline.image.colour import convert, encode_srgb, luminance
 from pipeline.image.display import display_exposure, display_transform
-from pipeline.light import prediction
+from pipeline.light import prediction, spheres
 from pipeline.transport import differential as d
-from pipeline.types import BallFit, Bracket, Camera, Plane, Raster, View
+from pipeline.types import BallFit, Bracket, Camera, Harmonics, Plane, Raster, View
 
 WIDTH = 560  # px of a stage's picture
+SPHERE = 240  # px of a rendered sphere
 MASKS = [((24, 25, 27), "clean"), ((240, 96, 70), "clipped in every frame"), ((70, 110, 220), "below the noise"),
          ((245, 200, 60), "frames disagree"), ((90, 220, 200), "defect, replaced")]  # fmt: skip
 UNTOUCHED = (24, 25, 27)
@@ -57,6 +58,7 @@ class Build:
     views: dict[str, View]
     balls: dict[str, BallFit]
     environment: Raster
+    harmonics: Harmonics
     plane: Plane
     albedo: Raster
     layers: Raster
@@ -273,6 +275,16 @@ def probe_part(build: Build) -> dict[str, Any]:
         known = np.isfinite(sigma) & (light.channels.get("seen", np.ones_like(sigma)) > 0)
         small = pictures.shrink(np.where(known, sigma / level, np.nan), WIDTH)
         shown.append(fig.heat_figure(small, 0.2, "Standard uncertainty", "of the radiance; grey: not known"))
+    view = build.views["plate"].world_from_camera
+    seen = spheres.pictures(light.rgb(), build.harmonics.coefficients, view, SPHERE)
+    exposure = display_exposure(build.photographs["plate"].rgb())
+    for name, ball in list(build.balls.items())[:1]:
+        crop = build.photographs[name].rgb()[prediction.ball_crop(build.camera, ball, 1.02)]
+        shown.append(fig.photo(pictures.thumbnail(crop, SPHERE, exposure), name, "the ball as photographed"))
+    shown += [
+        fig.photo(pictures.thumbnail(picture, SPHERE, exposure), f"A {name} sphere", "in this light, from the plate")
+        for name, picture in seen.items()
+    ]
     return {"figures": shown}
 
 

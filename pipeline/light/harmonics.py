@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 
-_COSINE_LOBE = np.pi * np.array([1, 2 / 3, 2 / 3, 2 / 3, 1 / 4, 1 / 4, 1 / 4, 1 / 4, 1 / 4])
+COSINE_LOBE = np.pi * np.array([1, 2 / 3, 2 / 3, 2 / 3, 1 / 4, 1 / 4, 1 / 4, 1 / 4, 1 / 4])
 
 
 def sh9_basis(directions: np.ndarray) -> np.ndarray:
@@ -30,6 +30,13 @@ def sh9_of_environment(rgb: np.ndarray) -> np.ndarray:
     return weighted.reshape(-1, 9).T @ np.asarray(rgb, float).reshape(height * width, -1)
 
 
+def sh9_sigma(variance: np.ndarray) -> np.ndarray:
+    """Standard uncertainty (9, C) of `sh9_of_environment` from the map's variance (H, W, C), texels independent."""
+    height, width = variance.shape[:2]
+    weighted = sh9_basis(latlong_directions(height, width)) * latlong_solid_angles(height, width)[..., None]
+    return np.sqrt((weighted**2).reshape(-1, 9).T @ np.asarray(variance, float).reshape(height * width, -1))
+
+
 def sh9_irradiance(coefficients: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Irradiance (N, C) at unit normals (N, 3) from coefficients (9, C)."""
-    return (sh9_basis(normals) * _COSINE_LOBE) @ coefficients
+    return (sh9_basis(normals) * COSINE_LOBE) @ coefficients

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.conventions import ACESCG, CAMERA_RGB, RADIANCE_UNIT
 from pipeline.run.stage import Artifact
-from pipeline.types import BallFit, Bracket, Camera, Emitter, Occluder, Plane, Proxy, Surface, View
+from pipeline.types import BallFit, Bracket, Camera, Emitter, Harmonics, Occluder, Plane, Proxy, Surface, View
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
@@ -40,6 +40,9 @@ ENVIRONMENT = Artifact(
     "world-oriented lat-long at the ball: R G B, variance.RGB, seen (0..1)",
     RADIANCE_UNIT,
     ACESCG,
+)
+HARMONICS = Artifact(
+    "harmonics", "json", "the environment's nine spherical harmonics", RADIANCE_UNIT + " sr", type=Harmonics
 )
 EMITTERS = Artifact(
     "emitters",

@@ -63,6 +63,8 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
         for name, values in raster.channels.items()
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **raster.attributes}
+    if "envmap" in header:
+        header["envmap"] = {"latlong": OpenEXR.ENVMAP_LATLONG, "cube": OpenEXR.ENVMAP_CUBE}[header["envmap"]]
     header["insitu:space"] = raster.space
     if raster.space == ACESCG:
         header["chromaticities"] = AP1_CHROMATICITIES
@@ -88,6 +90,8 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
             }
     except (RuntimeError, ValueError) as error:
         raise ArtifactError(f"{path}: not a readable EXR ({error})") from error
+    if "envmap" in header:
+        header["envmap"] = "cube" if header["envmap"] == OpenEXR.ENVMAP_CUBE else "latlong"
     found = header.get("insitu:space")
     if found is None:
         found = space_of_chromaticities(header.get("chromaticities"))
