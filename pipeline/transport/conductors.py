@@ -32,3 +32,15 @@ def preset(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Base colour (3,) and edge tint (3,), ACEScg, of ``insitu_gltf`` for a metal of `REFLECTANCE`."""
     facing, grazing = (np.array(values) for values in REFLECTANCE[name])
     return facing, grazing / (facing + (1 - facing) * (1 - GRAZING) ** 5)
+
+
+def reflectance_at(facing: np.ndarray, grazing: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Reflectance (..., 3) at a cosine of incidence (...), from that head on and at GRAZING (3,).
+
+    Schlick 1994 less Kutz, Hasan and Edmondson's dip ``cos (1 - cos)^6``, scaled to meet ``grazing``: what
+    ``insitu_gltf`` computes.
+    """
+    cosine = np.asarray(cosine, float)[..., None]
+    at_edge = facing + (1 - facing) * (1 - GRAZING) ** 5
+    dip = (at_edge - grazing) / (GRAZING * (1 - GRAZING) ** 6)
+    return np.asarray(facing + (1 - facing) * (1 - cosine) ** 5 - dip * cosine * (1 - cosine) ** 6)

@@ -1,0 +1,156 @@
+"""What the plane y = 0 looks like directly and in the ball, in one photograph: pairs of radiances, pixel by pixel.
+
+A pixel of the ball is followed from the camera over the ball to the plane; the point it meets is seen directly at its
+own pixel. The point is finite, so this is exact at any distance from the ball, and no reflection point has to be
+solved for. For a diffuse plane both show the same radiance: mirrored over direct is the ball's reflectance, free of
+exposure, since both stand in one photograph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.camera.lens import pixel_rays, project
+from pipeline.conventions import invert_rigid
+from pipeline.light.sampling import bilinear, planes
+from pipeline.probes import sphere_fit
+from pipeline.types import Camera
+
+SPLIT = 6  # rays per axis over the two pixels that a demosaicked pixel takes in
+MAX_ACROSS = 160  # pixels across the ball that are looked at: larger balls are looked at in steps
+NEAREST, FARTHEST = 1.3, 8.0  # distance from the foot, in radii: nearer, both are the contact's shadow
+BESIDE_PX = 4.0  # about the outline, where the direct picture may hold some of the ball
+LOOKUP_ROW = 1024
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """M pixels of the ball that mirror a visible point of the plane.
+
+    ``pixel`` (M, 2) column and row; ``sine`` (M,) of the incidence; ``point`` (M, 3) world [m]; ``mirrored`` and
+    ``direct`` (M, 3) radiance with ``mirrored_variance`` and ``direct_variance``; ``texture`` (M, 3): variance of the
+    direct radiance within the pixel, which says what a displacement or a blur of one pixel would change; ``slope``
+    (M,): sine of the elevation under which the point sees the ball; ``tilt`` (M,): that less the sine of the elevation
+    under which it sees the camera; ``azimuth`` (M,) of the point about the ball's foot.
+    """
+
+    pixel: np.ndarray
+    sine: np.ndarray
+    point: np.ndarray
+    mirrored: np.ndarray
+    mirrored_variance: np.ndarray
+    direct: np.ndarray
+    direct_variance: np.ndarray
+    texture: np.ndarray
+    slope: np.ndarray
+    tilt: np.ndarray
+    azimuth: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.sine)
+
+    def at(self, chosen: np.ndarray) -> Pairs:
+        """The chosen ones."""
+        return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+
+def plane_pairs(
+    picture: np.ndarray, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float,
+    limit: float = 0.97,
+) -> Pairs:  # fmt: skip
+    """Pairs of a photograph (H, W, 8) as `lookup_channels` gives it; ``centre`` (3,) in the camera frame, metres.
+
+    Left out: incidence beyond ``limit``, points nearer to or farther from the foot than a few radii, out of the frame,
+    hidden by the ball, and whatever touches an invalid or clipped pixel. The way from the ball to the plane is free:
+    a reflected ray leaves a sphere for good.
+    """
+    px = _ball_pixels(camera, centre, radius)
+    spread = ((np.arange(SPLIT) + 0.5) / SPLIT - 0.5) * 2  # +- 1 px about the centre
+    dx, dy = (part.ravel() for part in np.meshgrid(spread, spread))
+    share = (1 - np.abs(dx)) * (1 - np.abs(dy))
+    share /= share.sum()
+    _, sine, point = mirrored_points(camera, world_from_camera, centre, radius, px + 0.5)
+    foot = _foot(world_from_camera, centre)
+    near = np.linalg.norm((point - foot)[:, ::2], axis=-1) / radius
+    keep = (sine < limit) & (near > NEAREST) & (near < FARTHEST)
+    px, sine, point = px[keep], sine[keep], point[keep]
+    if not len(px):
+        return _none()
+    fine = (px[:, None] + 0.5 + np.stack([dx, dy], -1)).reshape(-1, 2)
+    _, _, there = mirrored_points(camera, world_from_camera, centre, radius, fine)
+    found, seen = _direct(picture, camera, world_from_camera, centre, radius, there)
+    found = found.reshape(len(px), -1, 8)
+    own = picture[px[:, 1], px[:, 0]].astype(float)
+    good = seen.reshape(len(px), -1).all(1) & (own[:, 6] > 0.999) & (own[:, 7] == 0)
+    good &= (found[..., 6].min(1) > 0.999) & (found[..., 7].max(1) == 0)
+    direct = np.einsum("mkc,k->mc", found[..., :3], share)
+    texture = np.einsum("mkc,k->mc", (found[..., :3] - direct[:, None]) ** 2, share)
+    variance = np.einsum("mkc,k->mc", found[..., 3:6], share)
+    slope = radius / np.linalg.norm(point - foot - (0, radius, 0), axis=-1)
+    position = world_from_camera[:3, 3]
+    tilt = slope - position[1] / np.linalg.norm(position - point, axis=-1)
+    azimuth = np.arctan2(*(point - foot)[:, ::2].T)
+    return Pairs(px, sine, point, own[:, :3], own[:, 3:6], direct, variance, texture, slope, tilt, azimuth).at(good)
+
+
+def mirrored_points(
+    camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float, px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of pixels (N, 2): outward normal of the ball (N, 3) and mirrored point of y = 0 (N, 3), world; sine (N,).
+
+    NaN where the ball is not hit, or does not mirror the plane.
+    """
+    rays = pixel_rays(camera, px)
+    along = rays @ centre
+    inside = along**2 - centre @ centre + radius**2
+    hit = (along - np.sqrt(np.where(inside >= 0, inside, np.nan)))[:, None] * rays
+    normal = (hit - centre) / radius
+    away = rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
+    sine = np.linalg.norm(np.cross(rays, normal), axis=-1)
+    rotation, position = world_from_camera[:3, :3], world_from_camera[:3, 3]
+    start, away = hit @ rotation.T + position, away @ rotation.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(away[:, 1] < 0, -start[:, 1] / away[:, 1], np.nan)
+    return normal @ rotation.T, sine, start + reach[:, None] * away
+
+
+def _ball_pixels(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Columns and rows (N, 2) of pixels about the ball, in steps when it is large."""
+    outline = sphere_fit.silhouette(camera, centre, radius, 2 * np.pi * np.arange(90) / 90)[0]
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.floor(outline.min(0)), 1, size - 2).astype(int)
+    high = np.clip(np.ceil(outline.max(0)), 1, size - 2).astype(int)
+    step = max(1, int(np.ceil((high - low).max() / MAX_ACROSS)))
+    columns, rows = np.arange(low[0], high[0] + 1, step), np.arange(low[1], high[1] + 1, step)
+    return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+
+
+def _foot(world_from_camera: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    foot = world_from_camera[:3, :3] @ centre + world_from_camera[:3, 3]
+    foot[1] = 0
+    return foot
+
+
+def _direct(
+    picture: np.ndarray, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float,
+    point: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Values (N, 8) of the pixels where world points (N, 3) are seen, and whether they are (N,)."""
+    camera_from_world = invert_rigid(world_from_camera)
+    local = point @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    px = project(camera, local)
+    distance = float(np.linalg.norm(centre))
+    with np.errstate(invalid="ignore"):
+        away = np.arccos(np.clip(local @ (centre / distance) / np.linalg.norm(local, axis=-1), -1, 1))
+        beside = np.arcsin(radius / distance) + BESIDE_PX / min(camera.fx, camera.fy)
+        seen = (px > 1).all(-1) & (px < np.array([camera.width, camera.height]) - 1).all(-1) & (away > beside)
+    shape = (-(-len(px) // LOOKUP_ROW), LOOKUP_ROW)  # OpenCV takes at most 32767 positions in one row
+    x, y = (np.resize(np.where(seen, px[:, i], 1), shape) for i in (0, 1))
+    return bilinear(planes(picture), x, y).reshape(-1, picture.shape[2])[: len(px)].astype(float), seen
+
+
+def _none() -> Pairs:
+    rows, none = np.zeros((0, 3)), np.zeros(0)
+    return Pairs(np.zeros((0, 2), int), none, rows, rows, rows, rows, rows, rows, none, none, none)
