@@ -125,6 +125,7 @@ class View(Record):
     ambiguity: float = np.inf  # squared residual of the second planar solution over the first
     alternative: Array | None = None  # (4, 4) the second planar solution, refined
     lens_covariance: Array | None = None  # (6, 9) of the pose with Camera's nine numbers; None when given
+    camera: Camera | None = None  # its own body, lens or size; None: the plate's
 
 
 class BallFit(Record):

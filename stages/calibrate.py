@@ -4,8 +4,9 @@ Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares
 (Gauss-Newton, poses eliminated). From one focal length without distortion, the terms k1, k2, separate fx and fy, p1 p2
 and k3 are offered in turn, twice; a term stays when photographs that it was not fitted to gain more than 9 in deviance
 per parameter (three standard errors of a Gaussian) and do so consistently. Covariance: inverse normal matrix of the
-chosen model times chi2 per degree of freedom. Limits: one focus and zoom for all photographs; a flat board; terms left
-out have no variance, so the evidence says what they could cost.
+chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Limits:
+one focus and zoom for all photographs of a camera; a flat board; terms left out have no variance, so the evidence says
+what they could cost.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_ve
 from pipeline.camera.lens import project, unproject
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration, read_grey
 from pipeline.camera.resection import refine, robust_scale
-from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS
+from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS, VIEW_CAMERAS
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.run.stage import Stage
 from pipeline.types import Camera, Result
@@ -52,9 +53,42 @@ class Photos:
 
 
 def compute(facts: dict[str, Any], board_photos: list[dict[str, str]], params: knobs.Calibrate) -> Result:
-    """The camera (pixels with the first centre at (0.5, 0.5)), from given numbers or from board photographs."""
-    if facts["camera"].get("given"):
-        camera = given_camera(facts["camera"]["given"])
+    """The plate's camera (pixels with the first centre at (0.5, 0.5)), and those of balls that state their own.
+
+    Balls that state one camera in the same words share one estimate; their figures bear the first one's name.
+    """
+    whole = calibrated(facts, "camera", facts["camera"], photos_of(board_photos, "plate"), params)
+    cameras: dict[str, Camera] = {}
+    done: list[tuple[dict[str, Any], Camera]] = []
+    for number, ball in enumerate(facts.get("ball", [])):
+        stated = ball.get("camera")
+        if stated is None:
+            continue
+        same = next((camera for other, camera in done if other == stated), None)
+        if same is None:
+            photos = photos_of(board_photos, ball["name"])
+            found = calibrated(facts, f"ball[{number}].camera", stated, photos, params)
+            same = found.outputs["camera"]
+            done.append((stated, same))
+            whole.numbers[ball["name"]] = found.numbers
+            whole.warnings.extend(f"{ball['name']}: {text}" for text in found.warnings)
+            whole.evidence.extend({**row, "term": f"{row['term']} ({ball['name']})"} for row in found.evidence)
+        cameras[ball["name"]] = same
+    return Result({**whole.outputs, "view_cameras": cameras}, whole.numbers, whole.warnings, whole.evidence)
+
+
+def photos_of(board_photos: list[dict[str, str]], view: str) -> list[dict[str, str]]:
+    """The board photographs of one view's camera."""
+    return [photo for photo in board_photos if photo.get("view", "plate") == view]
+
+
+def calibrated(
+    facts: dict[str, Any], where: str, stated: dict[str, Any], board_photos: list[dict[str, str]],
+    params: knobs.Calibrate,
+) -> Result:  # fmt: skip
+    """One camera, from its given numbers or from its board photographs."""
+    if stated.get("given"):
+        camera = given_camera(stated["given"], where)
         term = {
             "term": "intrinsics",
             "modelled": True,
@@ -70,19 +104,19 @@ def compute(facts: dict[str, Any], board_photos: list[dict[str, str]], params: k
     return judge(chosen, photos, errors, evidence, warnings, params)
 
 
-def given_camera(given: dict[str, Any]) -> Camera:
+def given_camera(given: dict[str, Any], where: str = "camera") -> Camera:
     """The manifest's numbers as a camera. Raises ManifestError with every problem."""
     known = {"width", "height", "fx", "fy", "cx", "cy", "distortion"}
-    problems = [f"camera.given.{key}: unknown key" for key in sorted(set(given) - known)]
-    problems += [f"camera.given.{key}: missing; it is required" for key in sorted(known - set(given) - {"distortion"})]
+    problems = [f"{where}.given.{key}: unknown key" for key in sorted(set(given) - known)]
+    problems += [f"{where}.given.{key}: missing; it is required" for key in sorted(known - set(given) - {"distortion"})]
     distortion = np.ravel(given.get("distortion", []))
     if len(distortion) > 5:
-        problems.append(f"camera.given.distortion: has {len(distortion)} terms; expected at most 5 (k1 k2 p1 p2 k3)")
+        problems.append(f"{where}.given.distortion: has {len(distortion)} terms; expected at most 5 (k1 k2 p1 p2 k3)")
     if problems:
         raise ManifestError(*problems)
     numbers = {key: given[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
     if min(numbers["width"], numbers["height"], numbers["fx"], numbers["fy"]) <= 0:
-        raise ManifestError(f"camera.given: is {numbers}; expected positive sizes and focal lengths")
+        raise ManifestError(f"{where}.given: is {numbers}; expected positive sizes and focal lengths")
     return Camera(**numbers, distortion=np.pad(distortion, (0, 5 - len(distortion))), source="given")
 
 
@@ -294,4 +328,10 @@ def judge(
     return Result({"camera": camera}, numbers, warnings, evidence)
 
 
-STAGE = Stage("calibrate", compute, knobs.Calibrate, {"facts": FACTS, "board_photos": BOARD_PHOTOS}, {"camera": CAMERA})
+STAGE = Stage(
+    "calibrate",
+    compute,
+    knobs.Calibrate,
+    inputs={"facts": FACTS, "board_photos": BOARD_PHOTOS},
+    outputs={"camera": CAMERA, "view_cameras": VIEW_CAMERAS},
+)

@@ -3,7 +3,8 @@
 Method: white balance of the mosaic by AsShotNeutral (so that interpolation does not colour edges), demosaicking
 (bilinear, Malvar-He-Cutler 2004 or Menon 2007), and one 3x3 matrix from camera_rgb to ACEScg by the DNG's one or two
 ColorMatrix tags (DNG 1.7.1 chapter 6, Bradford): the camera's neutral becomes (1, 1, 1) times its green signal. All
-views use one profile, so plate and ball agree. Variances go through the squared kernels and the squared matrix.
+views of one camera model use one profile; another model has its own matrices, and its neutral is how it would see the
+plate's white: however either was set, plate and ball agree. Variances go through squared kernels and squared matrix.
 
 Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance of
 neighbouring pixels and channels that kernels and matrix make; vignetting is not corrected. Values that touched a
@@ -33,7 +34,7 @@ from stages import knobs
 
 def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     """Photographs by view: R G B in radiance units, ACEScg; variance.RGB; mask."""
-    profiles = {view: profile_of(view, raster) for view, raster in mosaics.items()}
+    profiles = one_white({view: profile_of(view, raster) for view, raster in mosaics.items()})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         developed = list(
             pool.map(lambda v: develop(mosaics[v], profiles[v], method_of(v, params.demosaic), v), mosaics)
@@ -41,11 +42,14 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     photographs = dict(zip(mosaics, developed))
     numbers = {view: _numbers(raster) for view, raster in photographs.items()}
     warnings, evidence = [], [_vignetting()]
-    profile = next(iter(profiles.values()))  # merge gives all views one
-    if profile["as_shot_neutral"] is None:
-        warnings.append(f"{profile['file']}: no AsShotNeutral; the scene's white is taken as D65")
-    if profile["color_matrix_2"] is None:
-        evidence.append(_one_matrix(profile))
+    plate = plate_profile(profiles)
+    if plate["as_shot_neutral"] is None:
+        warnings.append(f"{plate['file']}: no AsShotNeutral; the scene's white is taken as D65")
+    for profile in {profile["camera"]: profile for profile in profiles.values()}.values():
+        if profile["color_matrix_2"] is None:
+            evidence.append(_one_matrix(profile))
+        if profile["camera"] != plate["camera"]:
+            evidence.append(_other_camera(profile))
     return Result({"photographs": photographs}, {"views": numbers}, warnings, evidence)
 
 
@@ -68,6 +72,30 @@ def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:
     for key in ("color_matrix", "color_matrix_2", "as_shot_neutral"):
         profile[key] = None if profile[key] is None else np.array(profile[key], float)
     return dict(profile)
+
+
+def plate_profile(profiles: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The plate's profile, or the first where there is no plate."""
+    return profiles.get("plate") or next(iter(profiles.values()))
+
+
+def one_white(profiles: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The profiles with the neutral of every other camera model set to how it sees the white of the plate's.
+
+    Each body has a white balance of its own; developed by those, a grey card would be neutral in both photographs even
+    under different lamps, and the ball's light would have lost its colour against the plate.
+    """
+    plate = plate_profile(profiles)
+    matrices = ("color_matrix", "color_matrix_2", "illuminant", "illuminant_2")
+    if plate["as_shot_neutral"] is None or plate["color_matrix"] is None:
+        return {view: {**p, "as_shot_neutral": plate["as_shot_neutral"]} for view, p in profiles.items()}
+    white = colour.camera_white(plate["color_matrix"], plate["as_shot_neutral"], *(plate[k] for k in matrices[1:]))[1]
+    return {
+        view: profile
+        if profile["camera"] == plate["camera"] or profile["color_matrix"] is None
+        else {**profile, "as_shot_neutral": colour.neutral_of_white(white, *(profile[k] for k in matrices))}
+        for view, profile in profiles.items()
+    }
 
 
 def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str) -> Raster:
@@ -127,6 +155,15 @@ def _one_matrix(profile: dict[str, Any]) -> dict[str, Any]:
         "modelled": False,
         "because": f"{profile['camera'] or profile['file']} carries one ColorMatrix",
         "could_cost": "colour error of 1 to 3 delta E under light far from the calibration illuminant",
+    }
+
+
+def _other_camera(profile: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "term": f"colour of {profile['camera'] or 'another camera'}",
+        "modelled": True,
+        "because": "views of another model than the plate's: its own ColorMatrix, the plate's white",
+        "could_cost": "a cast between plate and ball; a grey card or chart that both saw tells what is left",
     }
 
 

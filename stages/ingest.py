@@ -8,7 +8,7 @@ Frames of a view are sorted by exposure (label), then by name, so the order of t
 twice (same content) counts once. An exposure that EXIF lacks must be stated in [[exposure]]; it is never invented.
 Proxies and mesh occluders become triangles in the world frame here; a mask occluder is named by path and digest.
 
-Limits: Bayer RAW of one camera; every view has the plate's size.
+Limits: Bayer RAW; a view has the plate's size unless it states a camera of its own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeline.image.exposure import exposure_of
 from pipeline.image.raw import file_sha256, read_metadata
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
-from pipeline.run.formats import read_mask
+from pipeline.run.formats import read_latlong, read_mask
 from pipeline.run.manifest import CaptureFacts, SceneWishes, load_capture, load_toml, problems_of, resolve_files
 from pipeline.run.stage import Stage
 from pipeline.transport.meshes import load_meshes, refuse_undecodable
@@ -38,6 +38,7 @@ from stages import knobs
 
 OBJECT_SUFFIXES = (".glb", ".obj", ".ply")
 MASK_SUFFIXES = (".png", ".exr")
+MAP_SUFFIXES = (".hdr", ".exr")
 FAR_M = 100.0  # a local scene that reaches farther is in another unit
 DEFAULT_SCENE = "scene.toml"
 
@@ -56,6 +57,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     board = _board_photos(facts, root, manifest, problems)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
+    dumped["probe"] |= _probe_file(facts, root, manifest, problems, flaws)
     proxies = _proxies(facts, root, manifest, problems, warnings)
     occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
     if problems:
@@ -100,9 +102,31 @@ def _wishes(scene: Path | None, root: Path, problems: list[str]) -> dict[str, An
 
 
 def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str]) -> list[dict[str, str]]:
-    files, found = resolve_files(facts.camera.calibration, root, f"{manifest}: camera.calibration")
-    problems.extend(found)
-    return [{"file": file.relative_to(root).as_posix(), "sha256": file_sha256(file)} for file in files]
+    cameras = {"plate": ("camera", facts.camera)}
+    cameras |= {b.name: (f"ball[{i}].camera", b.camera) for i, b in enumerate(facts.ball) if b.camera is not None}
+    photos = []
+    for view, (key, camera) in cameras.items():
+        files, found = resolve_files(camera.calibration, root, f"{manifest}: {key}.calibration")
+        problems.extend(found)
+        photos += [{"file": f.relative_to(root).as_posix(), "sha256": file_sha256(f), "view": view} for f in files]
+    return photos
+
+
+def _probe_file(
+    facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]
+) -> dict[str, str]:
+    """Path and digest of the map that some kinds of probe are, once it could be read; empty for the others."""
+    name = getattr(facts.probe, "file", None)
+    if name is None:
+        return {}
+    path = _found(name, [manifest.parent, root], f"{manifest}: probe.file", MAP_SUFFIXES, problems)
+    if path is None:
+        return {}
+    try:
+        read_latlong(path)
+    except ArtifactError as error:
+        flaws.append(str(error))
+    return {"path": str(path), "sha256": file_sha256(path)}
 
 
 def _proxies(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], warnings: list[str]) -> list[Proxy]:
@@ -223,7 +247,7 @@ def _brackets(
         frames = [_restated(frame, stated.get(f, {})) for f in files if isinstance(frame := read_files[f], Frame)]
         role = "plate" if name == "plate" else "ball"
         brackets[name] = Bracket(name=name, role=role, frames=_sorted_unique(name, frames, flaws, warnings))
-    _check_sizes(brackets, flaws)
+    _check_sizes(brackets, {ball.name for ball in facts.ball if ball.camera is not None}, flaws, warnings)
     return brackets
 
 
@@ -262,17 +286,32 @@ def _sorted_unique(view: str, frames: list[Frame], flaws: list[str], warnings: l
     return sorted(kept.values(), key=lambda frame: (exposure_of(frame), frame.file))
 
 
-def _check_sizes(brackets: dict[str, Bracket], flaws: list[str]) -> None:
-    """One size and one colour filter within a bracket; balls as large as the plate, since one camera serves all."""
+def _check_sizes(brackets: dict[str, Bracket], own: set[str], flaws: list[str], warnings: list[str]) -> None:
+    """One size and one colour filter within a bracket; the plate's in every view whose camera is the plate's.
+
+    ``own``: views that state a camera of their own; its size is compared with the photograph's once it is developed.
+    """
     reference = brackets["plate"].frames[0] if brackets["plate"].frames else None
     for name, bracket in brackets.items():
         kinds = sorted({(frame.width, frame.height, frame.cfa) for frame in bracket.frames})
         shown = ", ".join(f"{width} x {height} {cfa}" for width, height, cfa in kinds)
+        models = sorted({frame.camera for frame in bracket.frames})
         if len(kinds) > 1:
             flaws.append(f"{name}: its frames are {shown}; needed one size and colour filter; take out the strangers")
-        elif reference and kinds and kinds[0] != (reference.width, reference.height, reference.cfa):
-            expected = f"{reference.width} x {reference.height} {reference.cfa}"
-            flaws.append(f"{name}: its frames are {shown}, the plate's {expected}; use one camera and one RAW size")
+        elif len(models) > 1:
+            flaws.append(f"{name}: its frames are of {' and '.join(models)}; needed one camera; take out the strangers")
+        elif reference and kinds and name not in own:
+            if kinds[0] != (reference.width, reference.height, reference.cfa):
+                expected = f"{reference.width} x {reference.height} {reference.cfa}"
+                flaws.append(
+                    f"{name}: its frames are {shown}, the plate's {expected}; use one camera and one RAW size, or "
+                    "state the ball's own camera: [[ball]] camera = { given = { ... } }"
+                )
+            elif models != [reference.camera]:
+                warnings.append(
+                    f"{name}: taken with {models[0] or 'an unnamed camera'}, the plate with {reference.camera or 'one'}"
+                    "; the plate's lens is taken for both; state [[ball]] camera if it had another"
+                )
 
 
 STAGE = Stage(

@@ -8,16 +8,17 @@ pipeline/image/{radiometry,exposure,tripod,noise}.py hold the equations and thei
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
 Limits: frames of a view are not aligned; their shift is measured and reported. Views that neither stand where the
-plate was taken from nor share an exposure setting with a view that is tied to the plate are scaled by their labels.
+plate was taken from nor share body and exposure setting with a view that is tied to it are scaled by their labels.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,10 @@ LIGHT_WARNING = 0.01  # static scene against shared settings
 def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.Merge) -> Result:
     """Merged mosaics by view and the exposures of their frames. Raises CaptureError when a file cannot be decoded."""
     root = Path(facts["capture_root"])
-    still = {ball["name"] for ball in facts.get("ball", []) if ball.get("tripod")}
-    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params, still)
+    balls = facts.get("ball", [])
+    still = {ball["name"] for ball in balls if ball.get("tripod")}
+    own = {ball["name"]: json.dumps(ball["camera"], sort_keys=True) for ball in balls if ball.get("camera")}
+    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params, still, own)
 
 
 def merge_brackets(
@@ -51,10 +54,12 @@ def merge_brackets(
     decode: Callable[[Frame], np.ndarray],
     params: knobs.Merge,
     still: Collection[str] = (),
+    own: Mapping[str, str] = MappingProxyType({}),
 ) -> Result:
     """The stage on mosaics wherever they come from: ``decode(frame)`` gives (H, W) DN.
 
-    ``still``: views taken from where the plate was taken.
+    ``still``: views taken from where the plate was taken. ``own``: views with another camera than the plate's, and what
+    tells it from others: one speed of two bodies is not one exposure.
     """
     workers = os.cpu_count() or 1
     entries = [(view, frame) for view, bracket in sorted(brackets.items()) for frame in _ordered(bracket.frames)]
@@ -67,7 +72,7 @@ def merge_brackets(
     if params.estimate_exposures:
         ratios = _ratios(views, frames, mosaics, models, limits)
         across = _ratios_across(views, frames, mosaics, models, limits, still)
-    offsets, sigmas = _exposures(views, frames, [*ratios, *across], params, warnings)
+    offsets, sigmas = _exposures(views, frames, [*ratios, *across], own, params, warnings)
     exposed = [
         Exposed(
             mosaic, exposure.exposure_of(frame) * float(np.exp(offset)), frame_black(frame), frame.white, limit, model
@@ -75,11 +80,11 @@ def merge_brackets(
         for frame, mosaic, offset, limit, model in zip(frames, mosaics, offsets, limits, models)
     ]
     rasters, numbers = {}, {}
-    profile = colour_profile(brackets, warnings)
+    profiles = colour_profiles(brackets, warnings)
     for view in brackets:
         members = [one for one, name in zip(exposed, views) if name == view]
         merged, hot = radiometry.replace_defects(radiometry.merge(members, params.weights, workers))
-        rasters[view] = raster_of(merged, next(f for f, name in zip(frames, views) if name == view), profile)
+        rasters[view] = raster_of(merged, next(f for f, name in zip(frames, views) if name == view), profiles[view])
         numbers[view] = _view_numbers(merged, hot, len(members))
         _warn_extremes(view, numbers[view], warnings)
     listing = _exposure_rows(brackets, views, frames, exposed, offsets, sigmas)
@@ -257,12 +262,16 @@ def _across_numbers(
 
 
 def _exposures(
-    views: list[str], frames: list[Frame], ratios: list[Ratio], params: knobs.Merge, warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
+    views: list[str], frames: list[Frame], ratios: list[Ratio], own: Mapping[str, str], params: knobs.Merge,
+    warnings: list[str],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """ln(estimated / label) and its standard uncertainty, per frame; warns where labels are all there is."""
     if not params.estimate_exposures:
         return np.zeros(len(frames)), np.full(len(frames), exposure.LABEL_SIGMA)
-    speeds = [(frame.exposure_s, frame.iso, frame.fnumber) for frame in frames]
+    speeds = [
+        (own.get(view, ""), frame.camera, frame.exposure_s, frame.iso, frame.fnumber)
+        for view, frame in zip(views, frames)
+    ]
     labels = np.array([exposure.exposure_of(frame) for frame in frames])
     offsets, sigmas = exposure.solve_exposures(labels, speeds, ratios)
     measured = {(ratio.long, ratio.short) for ratio in ratios}
@@ -283,20 +292,27 @@ def _exposures(
     return offsets, sigmas
 
 
-def colour_profile(brackets: dict[str, Bracket], warnings: list[str]) -> dict[str, Any]:
-    """What develop needs to turn camera_rgb into ACEScg: one profile for all views, the plate's (else the first's).
+def colour_profiles(brackets: dict[str, Bracket], warnings: list[str]) -> dict[str, dict[str, Any]]:
+    """What develop needs to turn camera_rgb into ACEScg, by view: one profile per camera model, from its first frame.
 
-    Automatic white balance changes AsShotNeutral from frame to frame; plate and ball must not differ by it.
+    The plate's comes first: automatic white balance changes AsShotNeutral from frame to frame, and plate and ball must
+    not differ by it.
     """
-    frames = [frame for bracket in brackets.values() for frame in _ordered(bracket.frames)]
-    first = _ordered(brackets["plate"].frames)[0] if "plate" in brackets else frames[0]
-    if first.as_shot_neutral is not None:
-        others = [frame.as_shot_neutral for frame in frames if frame.as_shot_neutral is not None]
-        if any(not np.allclose(other, first.as_shot_neutral, rtol=1e-3) for other in others):
-            warnings.append(f"white balance differs between frames; that of {first.file} is used for all views")
+    ordered = sorted(brackets, key=lambda view: view != "plate")
+    first: dict[str, Frame] = {}
+    for frame in (frame for view in ordered for frame in _ordered(brackets[view].frames)):
+        chosen = first.setdefault(frame.camera, frame)
+        one, other = frame.as_shot_neutral, chosen.as_shot_neutral
+        if one is not None and other is not None and not np.allclose(one, other, rtol=1e-3):
+            text = f"white balance differs between frames; that of {chosen.file} is used for all views"
+            if text not in warnings:
+                warnings.append(text)
     keys = ("camera", "color_matrix", "color_matrix_2", "illuminant", "illuminant_2", "as_shot_neutral")
-    dumped = first.model_dump(mode="json", include=set(keys))
-    return {"file": first.file, **{key: dumped[key] for key in keys}}
+    dumped = {
+        camera: {"file": frame.file, **{key: frame.model_dump(mode="json", include=set(keys))[key] for key in keys}}
+        for camera, frame in first.items()
+    }
+    return {view: dumped[bracket.frames[0].camera] for view, bracket in brackets.items()}
 
 
 def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:

@@ -22,7 +22,7 @@ from pipeline.camera.markers import fit_marker, grey, marker_points, tone
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px
 from pipeline.camera.resection import Resection, is_planar, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference, nearest_rotation
-from pipeline.run.artifacts import CAMERA, FACTS, PHOTOGRAPHS, VIEWS
+from pipeline.run.artifacts import CAMERA, FACTS, PHOTOGRAPHS, VIEW_CAMERAS, VIEWS
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.run.stage import Stage
 from pipeline.types import Camera, Raster, Result, View
@@ -46,15 +46,19 @@ class Estimate:
     ambiguity: float
 
 
-def compute(facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, params: knobs.Pose) -> Result:
-    """``world_from_camera`` of "plate" and of every ball."""
+def compute(
+    facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, view_cameras: dict[str, Camera],
+    params: knobs.Pose,
+) -> Result:  # fmt: skip
+    """``world_from_camera`` of "plate" and of every ball, and the camera of each that is not the plate's."""
     balls = {ball["name"]: bool(ball.get("tripod", False)) for ball in facts["ball"]}
     orders = {name: order_of(facts, name, balls) for name in ("plate", *balls)}
-    check_sizes(photographs, camera, list(orders))
+    cameras = {name: view_cameras.get(name, camera) for name in orders}
+    check_sizes(photographs, cameras)
     looked = [name for name, order in orders.items() if order["route"] in ("charuco", "marker")]
     with ThreadPoolExecutor(2) as pool:  # OpenCV releases the GIL
         sights = dict(
-            zip(looked, pool.map(lambda n: sight(facts, n, orders[n], photographs[n], camera), looked), strict=True)
+            zip(looked, pool.map(lambda n: sight(facts, n, orders[n], photographs[n], cameras[n]), looked), strict=True)
         )
     warnings: list[str] = []
     estimates: dict[str, Estimate] = {}
@@ -62,7 +66,7 @@ def compute(facts: dict[str, Any], photographs: dict[str, Raster], camera: Camer
     tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
     for name in orders:
         if name not in tripod:
-            estimate = estimate_view(name, orders[name], sights.get(name), camera, params)
+            estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
             views[name] = view_of(estimate) if isinstance(estimate, Estimate) else estimate
             if isinstance(estimate, Estimate):
                 estimates[name] = estimate
@@ -72,7 +76,8 @@ def compute(facts: dict[str, Any], photographs: dict[str, Raster], camera: Camer
     }
     for name, shift in shifts.items():
         numbers[name]["tripod_shift_px"] = shift
-    return Result({"views": {name: views[name] for name in orders}}, numbers, warnings, reasons(orders, views, camera))
+    placed = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
+    return Result({"views": placed}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
 
 def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:
@@ -94,9 +99,9 @@ def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[s
     raise ManifestError(f"view {name}: neither [board], [marker] nor a [[pose]] entry; needed one to orient it")
 
 
-def check_sizes(photographs: dict[str, Raster], camera: Camera, names: list[str]) -> None:
-    """Every view exists and has the size that the camera was calibrated at."""
-    for name in names:
+def check_sizes(photographs: dict[str, Raster], cameras: dict[str, Camera]) -> None:
+    """Every view exists and has the size that its camera was calibrated at."""
+    for name, camera in cameras.items():
         if name not in photographs:
             raise CaptureError(
                 f"{name}: no photograph was developed, needed one per view; check its files in the manifest"
@@ -320,7 +325,7 @@ def figures(
     return numbers
 
 
-def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], camera: Camera) -> list[dict[str, Any]]:
+def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: list[Camera]) -> list[dict[str, Any]]:
     """Which pose source each view took, and why."""
     why = {
         "charuco": "the board is described", "marker": "the single marker is described", "points": "asked for",
@@ -333,8 +338,8 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], camera: C
         }
         for name, view in views.items()
     ]  # fmt: skip
-    known = bool(np.any(camera.covariance))
-    because = "calibrated" if known else "the camera was given without covariance"
+    known = all(np.any(camera.covariance) for camera in cameras)
+    because = "calibrated" if known else "a camera was given without covariance"
     cost = "" if known else "pose covariances are too small by the unknown error of the intrinsics"
     return [
         *entries,
@@ -346,6 +351,6 @@ STAGE = Stage(
     "pose",
     compute,
     knobs.Pose,
-    {"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA},
+    {"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "view_cameras": VIEW_CAMERAS},
     {"views": VIEWS},
 )

@@ -153,6 +153,23 @@ def acescg_from_camera(
     color_matrix_2: np.ndarray | None = None,
     illuminant: int = 0,
     illuminant_2: int = 0,
+def neutral_of_white(
+    white: np.ndarray,
+    color_matrix: np.ndarray,
+    color_matrix_2: np.ndarray | None = None,
+    illuminant: int = 0,
+    illuminant_2: int = 0,
+) -> np.ndarray:
+    """How a camera sees a white given as XYZ (3,): its neutral (3,), green 1. The inverse of `camera_white`."""
+    kelvin = ILLUMINANT_K.get(illuminant, 0), ILLUMINANT_K.get(illuminant_2, 0)
+    current = color_matrix
+    if color_matrix_2 is not None and 0 not in kelvin and kelvin[0] != kelvin[1]:
+        temperature = temperature_of_xy(white[:2] / white.sum())
+        current = interpolated_matrix(color_matrix, color_matrix_2, kelvin, temperature)
+    neutral = current @ white
+    return np.asarray(neutral / neutral[1])
+
+
     where: str = "camera colour",
 ) -> np.ndarray:
     """(3, 3) matrix from camera_rgb (black subtracted, *not* white balanced) to ACEScg, by the DNG colour matrices.

@@ -13,7 +13,9 @@ and say so.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -79,11 +81,11 @@ def measure_ratio(
 
 
 def solve_exposures(
-    labels: np.ndarray, speeds: list[tuple[float, float, float]], ratios: list[Ratio]
+    labels: np.ndarray, speeds: Sequence[tuple[Any, ...]], ratios: list[Ratio]
 ) -> tuple[np.ndarray, np.ndarray]:
     """ln(estimated / label) (F,) of each frame and its standard uncertainty (F,) against the mean of all.
 
-    ``labels``: relative exposures by label (F,). ``speeds``: what the camera was set to, per frame; equals are tied.
+    ``labels``: relative exposures by label (F,). ``speeds``: which camera was set to what, per frame; equals are tied.
     Unknowns are one value per frame and one per distinct setting; the prior acts on the settings.
     """
     settings = sorted(set(speeds))
@@ -119,7 +121,7 @@ def solve_exposures(
     return solution[:count], np.sqrt(np.maximum(np.diag(covariance), 0))
 
 
-def linked_views(views: list[str], speeds: list[tuple[float, float, float]], ratios: list[Ratio]) -> list[set[str]]:
+def linked_views(views: list[str], speeds: Sequence[tuple[Any, ...]], ratios: list[Ratio]) -> list[set[str]]:
     """Views of each connected set of frames, joined by measured ratios and by shared settings.
 
     A view that no set holds together with another has its scale against it by label alone.

@@ -37,7 +37,7 @@ class MirrorBall:
         for name in names:
             plate = photographs["plate"] if name in tripod else None
             near = [ball.centre_world for ball in found.values()]
-            found[name] = find_ball(name, photographs[name], plate, camera, views[name], radius, near)
+            found[name] = find_ball(name, photographs[name], plate, shots.camera_of(name), views[name], radius, near)
             warnings += complaints(name, found[name], radius)
         space: Space = "linear_rec709" if facts["probe"].get("reflectance_space") == "linear_rec709" else "acescg"
         reflectance = convert(np.array(facts["probe"]["reflectance"], float), space, "acescg")

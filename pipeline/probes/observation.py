@@ -18,12 +18,16 @@ from pipeline.types import BallFit, Camera, Raster, View
 
 @dataclass(frozen=True)
 class Shots:
-    """Everything a kind may look at: validated facts, developed photographs, the lens and the poses of the views."""
+    """Everything a kind may look at: validated facts, developed photographs, the plate's camera, poses of the views."""
 
     facts: dict[str, Any]
     photographs: dict[str, Raster]
     camera: Camera
     views: dict[str, View]
+
+    def camera_of(self, view: str) -> Camera:
+        """The camera of a view: its own, else the plate's."""
+        return self.views[view].camera or self.camera
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,9 @@ from pipeline.types import BallFit, Bracket, Camera, Emitter, Harmonics, Occlude
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
 BRACKETS = Artifact("brackets", "json", "every RAW file by view, with its metadata", type=dict[str, Bracket])
-BOARD_PHOTOS = Artifact("board_photos", "json", "calibration photographs: file, sha256", type=list[dict[str, str]])
+BOARD_PHOTOS = Artifact(
+    "board_photos", "json", "calibration photographs: file, sha256, view they calibrate", type=list[dict[str, str]]
+)
 PROXIES = Artifact("proxies", "json", "further real surfaces of the local scene: meshes, albedo", "m", type=list[Proxy])
 OCCLUDERS = Artifact("occluders", "json", "real things before the objects: meshes or masks", "m", type=list[Occluder])
 
@@ -30,7 +32,8 @@ EXPOSURES = Artifact(
 )
 PHOTOGRAPHS = Artifact("photographs", "rasters", "developed view: R G B, variance.RGB, mask", RADIANCE_UNIT, ACESCG)
 
-CAMERA = Artifact("camera", "json", "intrinsics, distortion, covariance", "px", type=Camera)
+CAMERA = Artifact("camera", "json", "the plate's intrinsics, distortion, covariance", "px", type=Camera)
+VIEW_CAMERAS = Artifact("view_cameras", "json", "cameras of views that have their own", "px", type=dict[str, Camera])
 VIEWS = Artifact("views", "json", "pose of every view with covariance", "m, rad", type=dict[str, View])
 
 BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", type=dict[str, BallFit])

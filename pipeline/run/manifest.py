@@ -35,12 +35,28 @@ class PlateFacts(Strict):
     files: list[str] = Field(min_length=1, description="RAW files or globs, relative to root")
 
 
+class CameraFacts(Strict):
+    """Where the intrinsics come from: board photographs, or given numbers (pixel origin of conventions)."""
+
+    calibration: list[str] = Field([], description="board photographs, files or globs")
+    given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
+
+
 class BallFacts(Strict):
     """One view of the mirror ball."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     files: list[str] = Field(min_length=1)
     tripod: bool = Field(False, description="taken from the plate's own camera position")
+    camera: CameraFacts | None = Field(None, description="of another body, lens or size; without it, the plate's")
+
+    @model_validator(mode="after")
+    def _one_camera(self) -> BallFacts:
+        if self.camera is not None and self.tripod:
+            raise ValueError("tripod = true says the plate's camera in its place, camera another one; drop one of them")
+        if self.camera is not None and not self.camera.calibration and self.camera.given is None:
+            raise ValueError("camera: neither calibration photographs nor given numbers")
+        return self
 
 
 class ProbeFacts(Strict):
@@ -69,13 +85,6 @@ class MarkerFacts(Strict):
     dictionary: str = "DICT_5X5_100"
     id: int = Field(ge=0)
     side_m: float = Field(gt=0.001, lt=5.0)
-
-
-class CameraFacts(Strict):
-    """Where the intrinsics come from: board photographs, or given numbers (pixel origin of conventions)."""
-
-    calibration: list[str] = Field([], description="board photographs, files or globs")
-    given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
 
 
 class PointFacts(Strict):
@@ -166,7 +175,8 @@ class CaptureFacts(Strict):
                 raise ValueError(f"{kind} names are {given}; each must be unique")
         if not self.camera.calibration and self.camera.given is None:
             raise ValueError("camera: neither calibration photographs nor given numbers")
-        if self.camera.calibration and self.board is None:
+        cameras = [self.camera, *(ball.camera for ball in self.ball if ball.camera is not None)]
+        if any(camera.calibration for camera in cameras) and self.board is None:
             raise ValueError("camera.calibration needs [board]")
         return self
 
