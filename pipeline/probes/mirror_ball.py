@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import CLIPPED, latlong_solid_angles
+from pipeline.conventions import latlong_solid_angles
 from pipeline.image.colour import Space, convert
 from pipeline.probes import combine, sphere_fit
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
@@ -28,7 +28,7 @@ class MirrorBall:
 
     def observe(self, shots: Shots, grid: Grid) -> Observation:
         """One map per ball view. Raises CaptureError when there is no ball, or it cannot be used."""
-        facts, photographs, camera, views = shots.facts, shots.photographs, shots.camera, shots.views
+        facts, photographs, views = shots.facts, shots.photographs, shots.views
         radius = 0.5 * float(facts["probe"]["diameter_m"])
         names = [ball["name"] for ball in sorted(facts["ball"], key=lambda ball: not ball.get("tripod", False))]
         tripod = {ball["name"] for ball in facts["ball"] if ball.get("tripod", False)}
@@ -41,18 +41,14 @@ class MirrorBall:
             warnings += complaints(name, found[name], radius)
         space: Space = "linear_rec709" if facts["probe"].get("reflectance_space") == "linear_rec709" else "acescg"
         reflectance = convert(np.array(facts["probe"]["reflectance"], float), space, "acescg")
-        level = plate_level(photographs, camera, found, tripod, radius)
-        if level != 1:
-            warnings.append(f"the ball's photographs are {level:.4f} times as bright as the plate; brought to it")
         maps = {
-            name: view_map(photographs[name], camera, views[name], found[name], radius, reflectance, grid).scaled(
-                1 / level
+            name: view_map(
+                photographs[name], shots.camera_of(name), views[name], found[name], radius, reflectance, grid
             )
             for name in names
         }
         shade_photographers(maps, found, views, tripod)
         numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) for name in names}
-        numbers["ball_over_plate_exposure"] = level
         balls = {name: ball_record(found[name].fit, radius) for name in (ball["name"] for ball in facts["ball"])}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
         return Observation(maps, centre, balls, numbers, warnings, reasons(found, tripod))
@@ -117,30 +113,6 @@ def angular_sigma(
     growth = along * (fit.radius_px / np.linalg.norm(fit.centre)) ** 2
     turn = float(np.trace(view.covariance[:3, :3])) / 3
     return np.sqrt(radial**2 * (shift + sine**2 * growth) + across**2 * shift + 2 * turn), radial * across
-
-
-def plate_level(
-    photographs: dict[str, Raster], camera: Camera, found: dict[str, Found], tripod: set[str], radius: float
-) -> float:
-    """How much brighter the tripod's ball photograph is than the plate, away from the ball and its shadow.
-
-    Labels of exposure are wrong by percents; from one place the same table is the same light. Median over pixels more
-    than three ball radii from the ball that are known to 10 % in both; 1 without a tripod view or below 0.2 %.
-    """
-    for name in sorted(tripod & set(found)):
-        one, plate = photographs[name], photographs["plate"]
-        if one.shape != plate.shape:
-            continue
-        px = sphere_fit.silhouette(camera, found[name].fit.centre, radius, 2 * np.pi * np.arange(60) / 60)[0]
-        y, x = np.mgrid[: one.shape[0], : one.shape[1]]
-        far = np.hypot(x - px[:, 0].mean(), y - px[:, 1].mean()) > 3 * found[name].fit.radius_px
-        with np.errstate(invalid="ignore"):
-            good = far & (one["mask"] & CLIPPED == 0) & (plate["mask"] & CLIPPED == 0) & (plate["G"] > 0)
-            good &= np.hypot(np.sqrt(one["variance.G"]), np.sqrt(plate["variance.G"])) < 0.1 * plate["G"]
-        if good.sum() > 1000:
-            ratio = float(np.median(one["G"][good] / plate["G"][good]))
-            return ratio if abs(ratio - 1) > 2e-3 else 1.0
-    return 1.0
 
 
 def shade_photographers(
