@@ -14,6 +14,8 @@ from pipeline.camera.lens import unproject
 from pipeline.types import Camera
 
 Light = Callable[[np.ndarray], np.ndarray]
+Mirror = Callable[[np.ndarray, np.ndarray], np.ndarray]  # outward normals (N, 3), cosines (N,) -> reflectance (N, 3)
+Dent = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # unit (N, 3) -> height in radii (N,), gradient (N, 3)
 
 
 @dataclass
@@ -50,7 +52,8 @@ class Place:
     plane: bool = False
     ball: tuple[float, float, float] | None = (0.0, 0.04, 0.0)
     radius: float = 0.04
-    reflectance: float = 0.8
+    reflectance: float | tuple[float, float, float] | Mirror = 0.8
+    dent: Dent | None = None  # the ball is R (1 + height); slopes to first order
 
     def radiance(self, origin: np.ndarray, w: np.ndarray) -> np.ndarray:
         """RGB (N, 3) seen from ``origin`` (N, 3) along ``w`` (N, 3), the ball left out."""
@@ -72,15 +75,33 @@ class Place:
             return self.radiance(origin, w)
         to_ball = np.asarray(self.ball) - origin
         along = (to_ball * w).sum(1)
-        inside = self.radius**2 - (to_ball**2).sum(1) + along**2
+        size = np.full(len(w), self.radius)
+        if self.dent is not None:  # first where the ray is nearest to the centre, then where it meets the ball
+            size *= 1 + self.dent(_unit(along[:, None] * w - to_ball))[0]
+        inside = size**2 - (to_ball**2).sum(1) + along**2
         hit = (inside > 0) & (along > 0)
         rgb = np.empty_like(w)
         rgb[~hit] = self.radiance(origin[~hit], w[~hit])
-        point = origin[hit] + (along[hit] - np.sqrt(inside[hit]))[:, None] * w[hit]
-        normal = (point - self.ball) / self.radius
-        mirrored = w[hit] - 2 * (w[hit] * normal).sum(1, keepdims=True) * normal
-        rgb[hit] = self.reflectance * self.radiance(point, mirrored)
+        origin, w, to_ball, along, inside = origin[hit], w[hit], to_ball[hit], along[hit], inside[hit]
+        point = origin + (along - np.sqrt(inside))[:, None] * w
+        normal = _unit(point - self.ball)
+        for _ in range(4 if self.dent is not None else 0):
+            size = self.radius * (1 + self.dent(normal)[0])
+            point = origin + (along - np.sqrt(np.maximum(size**2 - (to_ball**2).sum(1) + along**2, 0)))[:, None] * w
+            normal = _unit(point - self.ball)
+        body = normal
+        if self.dent is not None:
+            normal = _unit(normal - self.dent(normal)[1])
+        cosine = -(w * normal).sum(1)
+        mirrored = w + 2 * cosine[:, None] * normal
+        given = self.reflectance
+        reflectance = given(body, np.clip(cosine, 0, 1)) if callable(given) else np.asarray(given)
+        rgb[hit] = reflectance * self.radiance(point, mirrored)
         return rgb
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:

@@ -1,0 +1,212 @@
+"""The ball's surface against ray-traced balls: its reflectance, given and measured, and how that depends on angle."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+from mirror_scene import Lamp, Place, look_at, photograph, sky
+
+from pipeline.conventions import invert_rigid, transform_points
+from pipeline.probes import ball_surface
+from pipeline.probes.ball_pairs import Pairs, plane_pairs
+from pipeline.probes.ball_surface import Measured, Surface, decide, measure
+from pipeline.transport.conductors import GRAZING, REFLECTANCE, preset, reflectance_at
+from pipeline.types import Camera
+
+RADIUS = 0.04
+CAMERA = Camera(
+    width=420, height=320, fx=1200, fy=1201, cx=205, cy=150, distortion=np.array([-0.08, 0.02, 5e-4, -3e-4, 0])
+)
+POSES = {"a": look_at((0.08, 0.27, 0.40), (0.05, 0.02, 0)), "b": look_at((0.45, 0.30, 0.05), (0.05, 0.02, 0))}
+ROOM = sky([Lamp((0.3, 0.8, 0.4), 0.06, 200.0)])
+BALL = (0.02, RADIUS, 0.01)
+TRUE = np.array([0.93, 0.90, 0.85])
+
+
+def channels(picture: np.ndarray, noise: float = 0.003) -> np.ndarray:
+    """What `lookup_channels` makes of a photograph."""
+    flags = np.zeros((*picture.shape[:2], 2))
+    flags[..., 0] = 1
+    return np.concatenate([picture, (noise * picture) ** 2, flags], -1).astype(np.float32)
+
+
+def chrome(normal: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """An edge that is far from Schlick's: tint 0.8."""
+    at_edge = (TRUE + (1 - TRUE) * (1 - GRAZING) ** 5) * 0.8
+    return reflectance_at(TRUE, at_edge, cosine)
+
+
+def schlick(normal: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    return reflectance_at(np.full(3, 0.3), np.full(3, 0.3 + 0.7 * (1 - GRAZING) ** 5), cosine)
+
+
+def even(*values: float) -> Any:
+    return lambda normal, cosine: np.broadcast_to(np.array(values), (*np.shape(cosine), 3))
+
+
+MIRRORS = {"plain": even(*TRUE), "tinted": even(0.55, 0.40, 0.15), "schlick": schlick, "chrome": chrome}
+
+
+@functools.cache
+def traced(view: str) -> Pairs:
+    """Pairs of a ray-traced ball of the mirror `chrome`."""
+    place = Place(ROOM, plane=True, ball=BALL, reflectance=chrome)
+    picture = photograph(place, CAMERA, POSES[view], 2, 0.003, 1)
+    centre = transform_points(invert_rigid(POSES[view]), np.array(BALL))
+    return plane_pairs(channels(picture), CAMERA, POSES[view], centre, RADIUS)
+
+
+def pairs(mirror: str, view: str) -> Pairs:
+    """The same picture with another mirror: each pixel times what the one reflects there over the other."""
+    found = traced(view)
+    cosine = np.sqrt(1 - found.sine**2)
+    factor = MIRRORS[mirror](None, cosine) / chrome(None, cosine)
+    return dataclasses.replace(
+        found, mirrored=found.mirrored * factor, mirrored_variance=found.mirrored_variance * factor**2
+    )
+
+
+def measured(mirror: str) -> Measured:
+    found = measure([pairs(mirror, view) for view in POSES])
+    assert found is not None
+    return found
+
+
+def test_both_ways_show_the_same_radiance():
+    """A perfect pair: mirrored over direct is the reflectance at every single point, up to texture and noise."""
+    found = pairs("plain", "a")
+    assert len(found) > 500
+    rel = np.sqrt(found.texture / found.direct**2).max(1)
+    smooth = rel < 0.01
+    ratio = found.mirrored[smooth] / found.direct[smooth] / TRUE
+    # 0.3 % photon noise, and 1 % of texture: 99 of 100 within three of both
+    assert np.quantile(np.abs(ratio - 1), 0.99) < 3 * np.hypot(0.003, 0.01)
+
+
+@pytest.mark.parametrize("mirror", ["plain", "tinted"])
+def test_reflectance_is_measured(mirror):
+    true, found = MIRRORS[mirror](None, 1.0), measured(mirror)
+    # three of its own standard uncertainties, which are to be useful: under 0.5 % (measured: error 0.02 %)
+    assert (np.abs(found.facing - true) < 3 * found.sigma).all()
+    assert (found.sigma / true < 0.005).all()
+    assert found.tint is None
+    assert not any(row["taken"] for row in found.tests)
+
+
+def test_schlick_is_found_where_it_is():
+    found = measured("schlick")
+    assert found.tint is not None
+    assert found.tint == pytest.approx(1.0, abs=0.05)
+    assert (np.abs(found.facing - 0.3) < 3 * found.sigma + 0.003).all()
+
+
+def test_a_dark_edge_is_found_where_it_is():
+    found = measured("chrome")
+    assert found.tint is not None
+    sine = np.sin(np.radians([0, 30, 50, 65]))
+    shape = Surface(found.facing, found.sigma, np.full(3, found.tint)).at(sine)
+    # 1 %: three of its own uncertainties at the angles that the plane covers (30 to 76 degrees)
+    assert shape == pytest.approx(chrome(None, np.sqrt(1 - sine**2)), rel=0.01)
+
+
+def test_known_metal_replaces_the_ladder():
+    _, tint = preset("chromium")
+    found = measure([pairs("plain", "a")], tint)
+    assert found is not None
+    assert found.tint is None
+    assert [row["term"] for row in found.tests] == ["gloss of the plane"]
+
+
+def test_too_little_plane_is_no_evidence():
+    found = pairs("plain", "a")
+    assert measure([found.at(np.arange(len(found)) < 100)]) is None
+    assert measure([found.at(found.azimuth > np.pi - 0.3)]) is None  # one sector says nothing of its own error
+
+
+def test_hidden_and_clipped_points_are_left_out():
+    place = Place(ROOM, plane=True, ball=BALL)
+    picture = channels(photograph(place, CAMERA, POSES["a"], 1))
+    centre = transform_points(invert_rigid(POSES["a"]), np.array(BALL))
+    free = plane_pairs(picture, CAMERA, POSES["a"], centre, RADIUS)
+    picture[:, :150, 7] = 1  # the left third is clipped: neither seen directly nor in the ball
+    rest = plane_pairs(picture, CAMERA, POSES["a"], centre, RADIUS)
+    assert 0 < len(rest) < len(free)
+    assert rest.pixel[:, 0].min() >= 150
+    behind = free.point - np.array(BALL) * (1, 0, 1)
+    to_camera = POSES["a"][:3, 3] - free.point
+    along = np.linalg.norm(np.cross(to_camera, behind - np.array([0, RADIUS, 0])), axis=1) / np.linalg.norm(
+        to_camera, axis=1
+    )
+    assert (along > RADIUS).all()  # no point is seen through the ball
+
+
+# ---- angle dependence ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(REFLECTANCE))
+def test_metals_pass_their_two_angles(name):
+    facing, grazing = (np.array(values) for values in REFLECTANCE[name])
+    assert reflectance_at(facing, grazing, np.array([1.0, GRAZING])) == pytest.approx(np.stack([facing, grazing]))
+    base, tint = preset(name)
+    surface = Surface(base, np.zeros(3), tint)
+    assert surface.at(np.array([0.0, np.sqrt(1 - GRAZING**2)])) == pytest.approx(np.stack([facing, grazing]))
+
+
+def test_without_a_tint_all_angles_are_the_same():
+    assert Surface(TRUE, np.zeros(3)).at(np.array([[0.0, 0.9], [np.nan, 1.0]])) == pytest.approx(
+        np.broadcast_to(TRUE, (2, 2, 3))
+    )
+
+
+# ---- what is used --------------------------------------------------------------------------------------------------
+
+
+def finding(values: np.ndarray, sigma: float = 0.004, tint: float | None = None) -> Measured:
+    return Measured(values, sigma * values, tint, 1000, 20, np.zeros(3))
+
+
+def test_given_stays_when_measured_agrees():
+    surface, warnings = decide(TRUE, None, finding(TRUE * 1.003))
+    assert (surface.facing == TRUE).all()
+    assert surface.source == "given"
+    assert not warnings
+    # two independent statements of the same thing
+    assert surface.sigma == pytest.approx(1 / np.hypot(1 / 0.004, 1 / ball_surface.GIVEN_SIGMA), rel=0.01)
+
+
+def test_given_is_doubted_when_measured_disagrees():
+    surface, warnings = decide(np.full(3, 0.93), None, finding(np.full(3, 0.80)))
+    assert (surface.facing == 0.93).all()
+    assert surface.sigma == pytest.approx(0.13 / 0.93, rel=1e-6)
+    assert "given (0.930, 0.930, 0.930), measured (0.800, 0.800, 0.800) +- (0.003, 0.003, 0.003)" in warnings[0]
+
+
+def test_measured_serves_when_nothing_is_given():
+    surface, warnings = decide(None, None, finding(TRUE, tint=1.0))
+    assert (surface.facing == TRUE).all()
+    assert surface.sigma == pytest.approx(0.004)
+    assert surface.tint == pytest.approx(1.0)
+    assert surface.source == "measured"
+    assert not warnings
+
+
+def test_metal_by_name():
+    surface, warnings = decide(None, "aluminium", None)
+    assert surface.facing == pytest.approx(REFLECTANCE["aluminium"][0])
+    assert surface.source == "aluminium"
+    assert surface.sigma == pytest.approx(ball_surface.GIVEN_SIGMA)
+    assert not warnings
+    scaled, _ = decide(TRUE, "aluminium", None)
+    assert (scaled.facing == TRUE).all()
+    assert scaled.tint is not None
+
+
+def test_nothing_known_is_chrome_and_said():
+    surface, warnings = decide(None, None, None)
+    assert surface.facing == pytest.approx(REFLECTANCE["chromium"][0])
+    assert (surface.sigma == 0.1).all()
+    assert "neither given nor measurable" in warnings[0]
