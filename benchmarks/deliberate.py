@@ -99,8 +99,9 @@ def traced_everywhere(canvas: Canvas) -> Canvas:
 def quieting(canvas: Canvas) -> tuple[np.ndarray, Effects]:
     """LS_noobj (H, W, 3), and per tile what speckles and denoiser (speckles included) do to change and object."""
     halves = finished(canvas)
-    raw, _ = pictures(replace(canvas, effort=replace(canvas.effort, denoise=False)), halves)
-    calm, quiet = pictures(canvas, halves)
+    (raw, _), (calm, quiet) = (
+        pictures(one, halves) for one in (replace(canvas, effort=replace(canvas.effort, denoise=False)), canvas)
+    )
     assert quiet is not None  # the effort asks for it
     noobj = raw["without"]
     return noobj, {

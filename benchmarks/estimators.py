@@ -137,8 +137,10 @@ def reference(stage: Loaded, plate: np.ndarray, samples: tuple[int, int], seed: 
     noisy = (np.sqrt(look.obj_variance + look.change_variance) > QUIET * level).any(1) | specular
     worlds, picture = stage.worlds, np.zeros_like(plate)
     if specular:
-        worlds = replace(worlds, photons=photons_for(worlds, stage.film.pixel_sr.size))
-        picture += thrown(worlds, stage.film, PHOTON_SAMPLES, seed + 2).sum(0).reshape(-1, 3)[stage.pixels]
+        pixels = stage.film.shape[0] * stage.film.shape[1]
+        worlds = replace(worlds, photons=photons_for(worlds, pixels))
+        light = thrown(worlds, stage.film, PHOTON_SAMPLES, seed + 2, lambda pixel: pixel, pixels)
+        picture += light.sum(0)[stage.pixels]
     for count, index in zip(samples, (np.flatnonzero(~noisy), np.flatnonzero(noisy)), strict=True):
         if len(index):
             part = trace(difference_block, worlds, stage.rays[index], count, REFERENCE_DEPTH, seed + 1)
@@ -242,7 +244,7 @@ def insitu(stage: Loaded, plate: np.ndarray, knobs: Render, seed: int, every: bo
     def composed(shot: Shot, quiet: bool, spent: float) -> Made:
         with cpu_seconds() as timer:
             canvas = replace(shot.canvas, effort=replace(effort, denoise=quiet))
-            layers = to_layers(Shot(canvas, shot.halves).drawn[0], canvas.region.weight)
+            layers = to_layers(Shot(canvas, shot.halves).drawn[0], canvas)
             result = composite.compose(photograph, layers, "auto")[0]
         samples = int(shot.halves.both.count.max())
         return Made(result.reshape(-1, 3), spent + timer.seconds, samples, quiet)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.camera.lens import project, ray_grid
+from pipeline.camera.lens import project
 from pipeline.conventions import ACESCG, invert_rigid, transform_points
 from pipeline.image.colour import Space, luminance
 from pipeline.image.display import display_exposure
@@ -31,12 +31,13 @@ from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.region import BLUR, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import object_shape
-from pipeline.transport.trace import Rays
+from pipeline.transport.trace import LensRays, Rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
 BLURRED = 1 + 4 * BLUR**2  # interpolation errs by an eighth of second differences, the pilot's blur by 4 BLUR^2 more
+STATISTICS_PX = 1 << 20  # pixels of the plate from which its median noise and its exposure are taken
 WORTH_A_RAY = 0.15  # of the irradiance: a weaker light is sampled with the sky, by its brightness
 Outcome = tuple[Raster, dict[str, Any], list[str]]  # layers, numbers, warnings
 
@@ -107,27 +108,29 @@ def compute(
             {"influenced_fraction": 0.0},
             ["scene.toml: no objects; the plate comes back"],
         )
-    diffuse_white = float(luminance(irradiance(environment.rgb(), plane.normal[None])[0])) / np.pi
-    shapes, warnings = place_objects(wishes, plane, diffuse_white)
-    xn, dxn = ray_grid(camera)
-    rays = Rays.of(views["plate"].world_from_camera, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
+    upward = irradiance(environment.rgb(), plane.normal[None])[0]
+    shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi)
+    rays = LensRays(camera, views["plate"].world_from_camera)
     plate = photographs["plate"]
-    sigma = np.sqrt(plate.rgb("variance").astype(float).mean(-1))
-    white = 2.0 ** -display_exposure(plate.rgb())
-    limits = limits_for(plate.rgb(), plate.rgb("variance"), params.threshold)
+    sigma = np.sqrt(sum(plate[f"variance.{c}"] for c in "RGB") / np.float32(3))
+    some = thinned(plate)
+    white = 2.0 ** -display_exposure(some.rgb())
+    limits = limits_for(some.rgb(), some.rgb("variance"), params.threshold)
     effort = Effort(
         params.strategy, params.samples, params.depth, params.denoise, params.seed, adaptive=not params.light_groups
     )
+
+    upward = irradiance(environment.rgb(), plane.normal[None])[0]
 
     def worlds_under(light: np.ndarray, lamps: list[Emitter], objects: dict[str, Any]) -> tuple[Worlds, np.ndarray]:
         worlds = build_worlds(plane, albedo.rgb(), light, objects, local_proxies, lamps, surface, occluders)
         return worlds, irradiance(light, plane.normal[None])[0]
 
     film = film_of(camera, views["plate"].world_from_camera, rays)
-    apart = strong(emitters, plane, irradiance(environment.rgb(), plane.normal[None])[0])
-    worlds, light = worlds_under(environment.rgb(), apart, shapes)
-    canvas, left = prepare(worlds, rays, shape, light, sigma, white, limits, effort, film, tell)
-    if not (canvas.region.weight > 0).any() or not len(canvas.traced):
+    apart = strong(emitters, plane, upward)
+    worlds = build_worlds(plane, albedo.rgb(), environment.rgb(), shapes, local_proxies, apart, surface, occluders)
+    canvas, left = prepare(worlds, rays, shape, upward, sigma, white, limits, effort, film, tell)
+    if not (canvas.part.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
         "threshold": limits.threshold,
@@ -156,12 +159,19 @@ def strong(emitters: list[Emitter], plane: Plane, light: np.ndarray) -> list[Emi
     return [e for e, part in zip(emitters, given, strict=True) if part >= WORTH_A_RAY * light.sum()]
 
 
-def film_of(camera: Camera, world_from_camera: np.ndarray, rays: Rays) -> Film:
+def thinned(picture: Raster) -> Raster:
+    """Every n-th pixel in both directions: about a million tell medians as well as 24."""
+    step = max(1, round(np.sqrt(picture.shape[0] * picture.shape[1] / STATISTICS_PX)))
+    return Raster({name: values[::step, ::step] for name, values in picture.channels.items()}, picture.space)
+
+
+def film_of(camera: Camera, world_from_camera: np.ndarray, rays: Rays | LensRays) -> Film:
     """Where photons land in the photograph."""
     camera_from_world = invert_rigid(world_from_camera)
     return Film(
         lambda points: project(camera, transform_points(camera_from_world, points)),
-        rays.solid_angles().reshape(camera.height, camera.width),
+        (camera.height, camera.width),
+        lambda pixels: rays[pixels].solid_angles(),
         world_from_camera[:3, 3],
     )
 
@@ -210,7 +220,7 @@ def outcome(shot: Shot) -> Outcome:
             numbers[f"speckle_share_{name}"] = part.speckle_share
     missing = numbers["not_finite_samples"]
     warnings = [f"render: {missing} samples were not finite and count as zero"] if missing else []
-    return to_layers(images, shot.canvas.region.weight), numbers, warnings
+    return to_layers(images, shot.canvas), numbers, warnings
 
 
 def groups(light: np.ndarray, emitters: list[Emitter]) -> dict[str, tuple[np.ndarray, list[Emitter]]]:
@@ -259,9 +269,9 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
     return Raster({name: np.zeros(shape, np.float32) for name in [*names, "obj.A", "ground", "influence"]}, ACESCG)
 
 
-def to_layers(images: dict[str, np.ndarray], weight: np.ndarray) -> Raster:
-    """Channels of the size of the plate; the feather scales the change."""
-    fade = weight[..., None]
+def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
+    """Channels of the size of the plate of pictures of the canvas's window; the feather scales the change."""
+    fade = canvas.part.weight[..., None]
     lost, gained = images["lost"] * fade, images["gained"] * fade
     layers = {
         "obj": images["obj"],
@@ -273,8 +283,9 @@ def to_layers(images: dict[str, np.ndarray], weight: np.ndarray) -> Raster:
         "objvariance": images["obj_variance"],
     }
     channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(rgb, layer).items()}
-    channels |= {"obj.A": images["alpha"], "ground": images["ground"], "influence": weight}
-    return Raster(channels, ACESCG)
+    channels |= {"obj.A": images["alpha"], "ground": images["ground"]}
+    framed = {name: canvas.framed(values) for name, values in channels.items()}
+    return Raster(framed | {"influence": canvas.region.weight}, ACESCG)
 
 
 def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
@@ -283,11 +294,11 @@ def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
     model = samples.albedo * canvas.light_at(canvas.traced) / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
     covered = (samples.alpha > 0.99) & (samples.obj > 0).any(1)
-    weight = canvas.region.weight
+    pixels = canvas.shape[0] * canvas.shape[1]
     numbers: dict[str, Any] = {
-        "influenced_fraction": float((weight > 0).mean()),
-        "traced_fraction": len(samples.count) / weight.size,
-        "object_fraction": float((samples.alpha > 0).sum() / weight.size),
+        "influenced_fraction": int((canvas.part.weight > 0).sum()) / pixels,
+        "traced_fraction": len(samples.count) / pixels,
+        "object_fraction": int((samples.alpha > 0).sum()) / pixels,
         "not_finite_samples": round(float((samples.not_finite * samples.count).sum())),
         "samples_per_traced_pixel": float(samples.count.mean()),
         "quiet_early_fraction": float((samples.count < samples.count.max()).mean()),

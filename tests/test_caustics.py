@@ -35,9 +35,16 @@ def film() -> Film:
     camera_from_world = invert_rigid(looking_down())
     return Film(
         lambda points: project(camera(), transform_points(camera_from_world, points)),
-        all_rays().solid_angles().reshape(SIZE),
+        SIZE,
+        lambda pixels: all_rays()[pixels].solid_angles(),
         looking_down()[:3, 3],
     )
+
+
+def cast(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
+    """(2, H, W, 3) thrown light of every pixel."""
+    pixels = film.shape[0] * film.shape[1]
+    return thrown(worlds, film, samples, seed, lambda pixel: pixel, pixels).reshape(2, *film.shape, 3)
 
 
 def placed(name: str, mesh: Mesh, bsdf: dict[str, Any]) -> Any:
@@ -76,7 +83,7 @@ def changes(worlds: Worlds, photons: float, seeds: range, objects: bool = False)
     pictures = []
     for seed in seeds:
         samples = trace(difference_block, worlds, all_rays(), SAMPLES, 16, seed)
-        light = thrown(worlds, film(), SAMPLES, 1000 + seed).reshape(2, -1, 3) if photons else np.zeros(2)
+        light = cast(worlds, film(), SAMPLES, 1000 + seed).reshape(2, -1, 3) if photons else np.zeros(2)
         own = samples.obj + light[1] if objects else 0.0
         pictures.append(samples.lost + samples.gained + light[0] + own)
     return pictures
@@ -159,7 +166,7 @@ class FlatMirror:
         self.worlds = replace(worlds, photons=0.2 * SIZE[0] * SIZE[1])
 
     def thrown(self, film: Film) -> np.ndarray:
-        return thrown(self.worlds, film, 256, 5)[0]
+        return cast(self.worlds, film, 256, 5)[0]
 
 
 def ground_points() -> tuple[np.ndarray, np.ndarray]:
@@ -218,15 +225,25 @@ def test_what_stands_before_the_camera_hides_thrown_light() -> None:
     worlds = build_worlds(ground(), ALBEDO, light, throwing_objects(), emitters=[lamp_of(light)])
     worlds = replace(worlds, photons=PHOTONS)
     alpha = trace(difference_block, worlds, all_rays(), 64, 2, 0).alpha.reshape(SIZE)
-    assert not thrown(worlds, film(), 64, 3)[0][minimum_filter(alpha == 1, 3)].any()
+    assert not cast(worlds, film(), 64, 3)[0][minimum_filter(alpha == 1, 3)].any()
 
 
 def test_a_part_of_the_frame_gets_its_part() -> None:
     """Photons beyond the frame are dropped, none is folded back: a crop is the same bytes as the crop of the whole."""
     mirror, whole = FlatMirror(), film()
     rows, columns = slice(10, 30), slice(7, 41)
-    crop = Film(lambda points: whole.project(points) - [7, 10], whole.pixel_sr[rows, columns], whole.origin)
+    shape, index = (20, 34), np.arange(SIZE[0] * SIZE[1]).reshape(SIZE)[rows, columns].ravel()
+    crop = Film(
+        lambda points: whole.project(points) - [7, 10],
+        shape,
+        lambda pixels: whole.pixel_sr(index[pixels]),
+        whole.origin,
+    )
     assert np.array_equal(mirror.thrown(crop), mirror.thrown(whole)[rows, columns])
+    # Two slots: the crop, and nowhere for the rest.
+    into = np.where(np.isin(np.arange(SIZE[0] * SIZE[1]), index), 0, -1)
+    total = thrown(mirror.worlds, whole, 256, 5, lambda pixel: into[pixel], 1)[0, 0]
+    np.testing.assert_allclose(total, mirror.thrown(crop).sum((0, 1)), rtol=1e-12)
 
 
 def test_nothing_is_thrown_without_lamps_or_objects() -> None:

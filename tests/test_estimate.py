@@ -82,7 +82,7 @@ def test_adaptive_differs_by_no_more_than_its_numbers_say() -> None:
     """
     canvas, halves, left, limits = adaptive()
     everything, weight = truth()[2], canvas.region.weight
-    images, _ = pictures(canvas, halves)
+    images = {name: canvas.framed(image) for name, image in pictures(canvas, halves)[0].items()}
     used = relative((images["lost"] + images["gained"]) * weight[..., None])
     exact = relative(everything.lost + everything.gained)
     error = np.abs(used - exact).reshape(*wholly(weight > 0).shape, 3).max(-1)
@@ -101,7 +101,7 @@ def test_adaptive_differs_by_no_more_than_its_numbers_say() -> None:
 def test_the_regions_border_is_hidden_by_the_photographs_noise() -> None:
     """The composite's step from a tile that is left alone to the next: below a quarter of the noise of its mean."""
     canvas, halves, _, limits = adaptive()
-    images, _ = pictures(canvas, halves)
+    images = {name: canvas.framed(image) for name, image in pictures(canvas, halves)[0].items()}
     change = relative((images["lost"] + images["gained"]) * canvas.region.weight[..., None])
     alone = wholly(canvas.region.weight == 0)
     border = binary_dilation(alone) & ~alone

@@ -18,7 +18,7 @@ from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
 
 NEWTON_STEPS = 30
-BLOCK = 1 << 15  # pixels per block of the ray grid: its temporaries stay in the cache
+BLOCK = 1 << 15  # pixels at once: their temporaries stay in the cache
 
 
 def fold_radius_squared(distortion: np.ndarray) -> float:
@@ -140,24 +140,32 @@ def pixel_rays(camera: Camera, px: np.ndarray) -> np.ndarray:
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
-def ray_grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Undistorted normalised coordinates of every pixel centre and their derivative by the pixel, for jittered rays.
+def rays_through(camera: Camera, px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Undistorted normalised coordinates of pixels and their derivative by the pixel, for jittered rays.
+
+    Args:
+        camera: the lens.
+        px: (N, 2) pixels.
 
     Returns:
-        xn: (H, W, 2) float64; the ray of pixel (row, col) is (xn, 1) in the camera frame.
-        dxn: (H, W, 2, 2) float64; ``dxn[..., i, j] = d xn_i / d px_j`` with px = (x, y).
+        xn: (N, 2) float64; the ray of a pixel is (xn, 1) in the camera frame.
+        dxn: (N, 2, 2) float64; ``dxn[:, i, j] = d xn_i / d px_j`` with px = (x, y).
     """
-    height, width = camera.height, camera.width
-    xn = np.empty((height, width, 2))
-    dxn = np.zeros((height, width, 2, 2))
-    inverse_focal = np.array([1 / camera.fx, 1 / camera.fy])
-    rows_per_block = max(1, BLOCK // width)
-    for top in range(0, height, rows_per_block):
-        rows = slice(top, min(top + rows_per_block, height))
-        y, x = np.meshgrid(np.arange(rows.start, rows.stop) + 0.5, np.arange(width) + 0.5, indexing="ij")
-        xn[rows] = unproject(camera, np.stack([x, y], -1))
-        jacobian = distortion_jacobian(camera.distortion, xn[rows])
-        a, b, d = jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 1]
-        inverse = np.stack([np.stack([d, -b], -1), np.stack([-b, a], -1)], -2) / (a * d - b * b)[..., None, None]
-        dxn[rows] = inverse * inverse_focal
+    xn = np.empty((len(px), 2))
+    dxn = np.empty((len(px), 2, 2))
+    for start in range(0, len(px), BLOCK):
+        some = slice(start, start + BLOCK)
+        xn[some] = unproject(camera, px[some])
+        jacobian = distortion_jacobian(camera.distortion, xn[some])
+        a, b, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1]
+        determinant = a * d - b * b
+        dxn[some, 0, 0], dxn[some, 1, 1] = d / determinant / camera.fx, a / determinant / camera.fy
+        dxn[some, 0, 1], dxn[some, 1, 0] = -b / determinant / camera.fy, -b / determinant / camera.fx
     return xn, dxn
+
+
+def ray_grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """`rays_through` every pixel centre: (H, W, 2) and (H, W, 2, 2)."""
+    y, x = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
+    xn, dxn = rays_through(camera, np.stack([x.ravel(), y.ravel()], -1))
+    return xn.reshape(*x.shape, 2), dxn.reshape(*x.shape, 2, 2)

@@ -28,18 +28,20 @@ from pipeline.transport.scene import LightGroup, Worlds
 MIRRORS = 12  # longest chain of mirrors and glass surfaces
 PHOTONS_PER_SAMPLE = 0.3  # photons for every pixel and every sample of it
 PHOTONS_PER_BLOCK = 1 << 21
+Slot = Callable[[np.ndarray], np.ndarray]  # of flat indices of pixels (N,): where their light goes, -1 for nowhere
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
     """Where photons land: through the photograph's own lens.
 
-    ``project``: world points (N, 3) to pixels (N, 2), NaN where the lens does not see them. ``pixel_sr``: (H, W) solid
-    angle of each pixel. ``origin``: (3,) the camera.
+    ``project``: world points (N, 3) to pixels (N, 2), NaN where the lens does not see them. ``shape``: (H, W).
+    ``pixel_sr``: flat indices (N,) of pixels to their solid angles (N,). ``origin``: (3,) the camera.
     """
 
     project: Callable[[np.ndarray], np.ndarray]
-    pixel_sr: np.ndarray
+    shape: tuple[int, int]
+    pixel_sr: Callable[[np.ndarray], np.ndarray]
     origin: np.ndarray
 
 
@@ -86,14 +88,15 @@ def against_camera(worlds: Worlds, hit: Any, back: Any, light: Any) -> Any:
     return dr.select(leaving > 0, ratio, 0.0)
 
 
-def thrown(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
-    """(2, H, W, 3) radiance of the local scene, and of objects, by light that emitters send there by way of objects.
+def thrown(worlds: Worlds, film: Film, samples: int, seed: int, slot: Slot, slots: int) -> np.ndarray:
+    """(2, slots, 3) radiance of the local scene, and of objects, by light that emitters send there by way of objects.
 
     Takes ``worlds.photons`` photons for each of ``samples`` samples of a pixel, for each emitter. Add it to what paths
-    from the camera find with the same ``worlds.photons``; together they are unbiased.
+    from the camera find with the same ``worlds.photons``; together they are unbiased. ``slot`` tells where the light of
+    a pixel goes, pixels by their flat indices (N,), -1 for nowhere; a slot of several pixels gets their sum.
     """
-    height, width = film.pixel_sr.shape
-    picture = np.zeros((3, 2 * height * width))
+    height, width = film.shape
+    picture = np.zeros((3, 2 * slots))
     lamps = [group for group in worlds.lights if group.compact]
     wanted = max(1, round(worlds.photons * samples))
     for number, lamp in enumerate(lamps):
@@ -105,14 +108,17 @@ def thrown(worlds: Worlds, film: Film, samples: int, seed: int) -> np.ndarray:
                 column, row = np.floor(pixel).T
                 inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
             index = (row[inside] * width + column[inside]).astype(int)
-            layer = index + height * width * landed["on_object"][inside].astype(int)
-            per_area = landed["per_area"][inside] / film.pixel_sr.ravel()[index]  # pixels per m^2 of the surface
+            place = slot(index)
+            wished = place >= 0
+            inside, index, place = np.flatnonzero(inside)[wished], index[wished], place[wished]
+            layer = place + slots * landed["on_object"][inside].astype(int)
+            per_area = landed["per_area"][inside] / film.pixel_sr(index)  # pixels per m^2 of the surface
             ratio = landed["ratio"][inside] / per_area
             share = np.where(np.isinf(ratio), 1.0, ratio / (1 + np.where(np.isinf(ratio), 0, ratio)))
             value = landed["value"][inside] * (share * per_area / wanted)[:, None]
             for channel in range(3):
-                picture[channel] += np.bincount(layer, value[:, channel], 2 * height * width)
-    return np.moveaxis(picture.reshape(3, 2, height, width), 0, -1)
+                picture[channel] += np.bincount(layer, value[:, channel], 2 * slots)
+    return np.moveaxis(picture.reshape(3, 2, slots), 0, -1)
 
 
 def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int) -> dict[str, np.ndarray]:

@@ -29,13 +29,35 @@ from pipeline.transport.denoise import (
 )
 from pipeline.transport.difference import difference_block
 from pipeline.transport.passes import Halves, refine
-from pipeline.transport.region import CELL, Limits, Region, cell_pixels, plan
+from pipeline.transport.region import (
+    BLUR_NOISE,
+    CELL,
+    WHOLE,
+    Limits,
+    Region,
+    Window,
+    cell_pixels,
+    near_objects,
+    plan,
+    worth_a_look,
+)
 from pipeline.transport.scene import Worlds
-from pipeline.transport.trace import Rays, Samples, Strategy, centre_albedo, reference_block, trace, unchanged_block
+from pipeline.transport.trace import (
+    LensRays,
+    Rays,
+    Samples,
+    Strategy,
+    centre_albedo,
+    reference_block,
+    trace,
+    unchanged_block,
+)
 
 STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
 PILOT_SHARE = 8  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
-MOST_PILOT = 512
+MOST_PILOT = 512  # at first; where the pilot stands for pixels and is too noisy for it, all of its share
+GLANCE = 2  # samples of every cell; as many as the first pass takes, so that kernels are compiled once
+GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
 PILOT_PHOTONS = 2  # samples' worth
@@ -68,7 +90,7 @@ class Canvas:
     """What is computed where. ``light``: irradiance E, (3,) or per pixel (H W, 3)."""
 
     worlds: Worlds
-    rays: Rays  # of every pixel
+    rays: Rays | LensRays  # of every pixel
     shape: tuple[int, int]
     region: Region
     light: np.ndarray
@@ -77,30 +99,57 @@ class Canvas:
     effort: Effort
     film: Film | None = None  # where light tracing is worth its cost
 
-    @property
+    @functools.cached_property
     def traced(self) -> np.ndarray:
         """Flat index of the pixels that are sampled."""
         return np.flatnonzero(self.region.traced)
 
     @functools.cached_property
+    def window(self) -> Window:
+        """Rows and columns around the region: all that is computed is a picture of this size."""
+        return bounding_window(self.region.weight > 0)
+
+    @functools.cached_property
+    def part(self) -> Region:
+        """The region within the window."""
+        return self.region[self.window]
+
+    @functools.cached_property
+    def places(self) -> np.ndarray:
+        """Flat index of the traced pixels within the window."""
+        return np.flatnonzero(self.part.traced)
+
+    @functools.cached_property
     def smooth_albedo(self) -> np.ndarray:
-        """(H, W, 3) albedo where the change is interpolated, at the middle of the pixel; zero elsewhere."""
-        pixels = np.flatnonzero(self.region.interpolated)
-        image = np.zeros((self.region.traced.size, 3))
-        image[pixels] = centre_albedo(self.worlds, self.rays[pixels])
-        return image.reshape(*self.shape, 3)
+        """(h, w, 3) of the window: albedo where the change is interpolated, at the middle of the pixel; else zero."""
+        there = self.part.interpolated
+        image = np.zeros((*there.shape, 3), np.float32)
+        image[there] = centre_albedo(self.worlds, self.rays[in_frame(self.window, self.shape)[there]])
+        return image
 
     def light_at(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 3) or (3,) irradiance of the pixels."""
         return self.light if self.light.ndim == 1 else self.light[pixels]
 
+    def framed(self, picture: np.ndarray) -> np.ndarray:
+        """A picture of the window (h, w, ...) in the frame (H, W, ...), zero around it."""
+        image = np.zeros((*self.shape, *picture.shape[2:]), np.float32)
+        image[self.window] = picture
+        return image
+
 
 Tell = Callable[[str], Callable[[float], None]]
 
 
+def in_frame(window: Window, shape: tuple[int, int]) -> np.ndarray:
+    """(h, w) flat indices in a frame (H, W) of the pixels of a window."""
+    rows, columns = (np.arange(size)[part] for size, part in zip(shape, window, strict=True))
+    return np.asarray(rows[:, None] * shape[1] + columns)
+
+
 def prepare(
     worlds: Worlds,
-    rays: Rays,
+    rays: Rays | LensRays,
     shape: tuple[int, int],
     light: np.ndarray,
     plate_sigma: np.ndarray,
@@ -124,26 +173,21 @@ def prepare(
         film: the photograph's lens, for light tracing; None to leave all light to paths from the camera.
         tell: gives a progress callback for a named task.
     """
-    index, grid = cell_pixels(*shape)
-    samples = min(max(64, PILOT_SHARE * effort.samples), MOST_PILOT)
-    closed = worlds.convex and worlds.diffuse
     film = film if effort.strategy == "difference" and throws(worlds) else None
     if film is not None:
         worlds = replace(worlds, photons=photons_for(worlds, min(shape[0] * shape[1], PILOT_PIXELS)))
-    pilot = trace(
-        difference_block, worlds, rays[index], samples, effort.depth, effort.stream + 1, CELL, tell("render: pilot")
-    )
-    share = 0.0
-    if film is not None:
-        light_by_cell = cells_of(thrown(worlds, film, PILOT_PHOTONS, effort.stream + 1)[0])
-        share = float(light_by_cell.sum() / max((pilot.gained + light_by_cell).sum(), 1e-30))
-        pilot = replace(pilot, gained=pilot.gained + light_by_cell)
-        if share < WORTH_TRACING:
-            film, worlds = None, replace(worlds, photons=0.0)
-    cell_light = light if closed else received(worlds, rays[index], grid, samples, effort, CELL)
-    region, left = plan(pilot, pilot.albedo * cell_light / np.pi, grid, shape, limits)
-    if effort.strategy == "reference" or not effort.adaptive:
+    pilot = looked(worlds, rays, shape, light, limits, effort, film, tell("render: pilot"))
+    region, left = plan(pilot.samples, pilot.model, pilot.grid, shape, limits, pilot.glanced)
+    if effort.adaptive and effort.strategy == "difference":
+        noisy = pilot.too_noisy(region, limits)
+        if len(noisy) and (more := PILOT_SHARE * effort.samples - pilot_samples(effort)) > 0:
+            pilot = pilot.refined(worlds, noisy, more, effort, tell("render: soft shadows"))
+            region, left = plan(pilot.samples, pilot.model, pilot.grid, shape, limits, pilot.glanced)
+    else:
         region = replace(region, traced=region.weight > 0)
+    share = float(pilot.thrown.sum() / max(pilot.samples.gained.sum(), 1e-30))
+    if share < WORTH_TRACING:
+        film, worlds = None, replace(worlds, photons=0.0)
     if film is not None:
         worlds = replace(worlds, photons=photons_for(worlds, int(region.traced.sum())))
     canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort, film)
@@ -156,21 +200,101 @@ def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda w
     ``light`` (3,) is the irradiance on the plane under their distant light; it is all of E on a plane alone.
     """
     if not (worlds.convex and worlds.diffuse):
-        # A picture around the region, for its smoothing.
-        part = np.zeros(canvas.shape, bool)
-        part[bounding_window(canvas.region.weight > 0)] = True
-        inside, size = np.flatnonzero(part), (part.any(1).sum(), part.any(0).sum())
-        light = np.zeros((part.size, 3))
-        effort = canvas.effort
-        light[inside] = received(
-            worlds, canvas.rays[inside], size, effort.samples, effort, 1.0, tell("render: without")
-        )
+        inside = in_frame(canvas.window, canvas.shape)
+        light = np.zeros((canvas.shape[0] * canvas.shape[1], 3))
+        light[inside.ravel()] = received(
+            worlds, canvas.rays[inside.ravel()], inside.shape, canvas.effort.samples, canvas.effort, 1.0,
+            tell("render: without"),
+        )  # fmt: skip
     return replace(canvas, worlds=replace(worlds, photons=canvas.worlds.photons), light=light)
 
 
-def cells_of(picture: np.ndarray) -> np.ndarray:
-    """(cells, 3) means of a picture (H, W, 3) over the region's cells."""
-    return np.stack([tile_means(picture[..., channel]).ravel() for channel in range(3)], -1)
+@dataclass(frozen=True, eq=False)
+class Pilot:
+    """What is known of the cells before any pixel is traced: those that are ``glanced`` at have `GLANCE` samples."""
+
+    rays: Rays  # of the cells
+    samples: Samples  # thrown light in it
+    model: np.ndarray  # (cells, 3) expected LS_noobj
+    thrown: np.ndarray  # (cells, 3) what light tracing finds
+    glanced: np.ndarray  # (cells,) bool
+    grid: tuple[int, int]
+    index: np.ndarray  # (cells,) flat index of the pixel in the middle
+
+    def too_noisy(self, region: Region, limits: Limits) -> np.ndarray:
+        """Indices of the cells that stand for their pixels, and whose noise is more than interpolation may err by."""
+        stands = (region.weight.ravel()[self.index] > 0) & ~region.traced.ravel()[self.index] & ~self.glanced
+        known = stands & (self.model > 0).all(1)
+        relative = self.samples.change_variance[known] / self.model[known] ** 2
+        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > limits.tolerance]
+
+    def refined(
+        self, worlds: Worlds, cells: np.ndarray, samples: int, effort: Effort, progress: Callable[[float], None]
+    ) -> Pilot:
+        """With so many more samples of some cells."""
+        seed = effort.stream + REFINED
+        more = trace(difference_block, worlds, self.rays[cells], samples, effort.depth, seed, CELL, progress)
+        more = replace(more, gained=more.gained + self.thrown[cells])
+        return replace(self, samples=self.samples.placed(cells, more))
+
+
+def pilot_samples(effort: Effort) -> int:
+    """Samples of a cell where a glance is not enough."""
+    return min(max(64, PILOT_SHARE * effort.samples), MOST_PILOT)
+
+
+def looked(
+    worlds: Worlds,
+    rays: Rays | LensRays,
+    shape: tuple[int, int],
+    light: np.ndarray,
+    limits: Limits,
+    effort: Effort,
+    film: Film | None,
+    progress: Callable[[float], None],
+) -> Pilot:
+    """A glance at every cell, and the pilot's samples where `worth_a_look` asks for them; arguments of `prepare`."""
+    index, grid = cell_pixels(*shape)
+    cells = rays[index]
+    bounces = light_by_cell(worlds, film, grid, effort) if film is not None else np.zeros((len(index), 3))
+
+    def traced(which: np.ndarray, samples: int, seed: int) -> Samples:
+        found = trace(
+            difference_block, worlds, cells[which], samples, effort.depth, effort.stream + seed, CELL, progress
+        )
+        return replace(found, gained=found.gained + bounces[which])
+
+    closed = worlds.convex and worlds.diffuse
+    glance = traced(np.arange(len(index)), GLANCE, GLANCED)
+    cell_light = (
+        np.broadcast_to(light, (len(index), 3)) if closed else received(worlds, cells, grid, GLANCE, effort, CELL)
+    )
+    near = near_objects(worlds, cells)
+    wanted = worth_a_look(glance, glance.albedo * cell_light / np.pi, grid, limits, near)
+    some = np.flatnonzero(wanted)
+    samples = glance.replaced(some, traced(some, pilot_samples(effort), 1)) if len(some) else glance
+    if not closed and len(some):
+        part = np.ix_(*(np.arange(there.min(), there.max() + 1) for there in np.nonzero(wanted.reshape(grid))))
+        inside = np.arange(len(index)).reshape(grid)[part]
+        cell_light[inside.ravel()] = received(
+            worlds, cells[inside.ravel()], inside.shape, pilot_samples(effort), effort, CELL
+        )
+    return Pilot(cells, samples, samples.albedo * cell_light / np.pi, bounces, ~wanted, grid, index)
+
+
+def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> np.ndarray:
+    """(cells, 3) mean radiance of the local scene by what emitters send there by way of objects."""
+    height, width = film.shape
+
+    def cell(pixel: np.ndarray) -> np.ndarray:
+        row, column = np.divmod(pixel, width)
+        return np.asarray(row // CELL * grid[1] + column // CELL)
+
+    total = thrown(worlds, film, PILOT_PHOTONS, effort.stream + 1, cell, grid[0] * grid[1])[0]
+    rows, columns = (
+        np.minimum(CELL, size - CELL * np.arange(n)) for size, n in zip((height, width), grid, strict=True)
+    )
+    return np.asarray(total / (rows[:, None] * columns).reshape(-1, 1))
 
 
 def received(
@@ -216,9 +340,13 @@ def sampled(
     def noisy(halves: Halves, ahead: int) -> np.ndarray:
         return still_noisy(canvas, halves, ahead) if effort.adaptive else halves.open
 
+    def place(pixel: np.ndarray) -> np.ndarray:
+        found = np.minimum(np.searchsorted(canvas.traced, pixel), len(canvas.traced) - 1)
+        return np.where(canvas.traced[found] == pixel, found, -1)
+
     def light(samples: int, seed: int) -> np.ndarray:
         assert canvas.film is not None
-        return thrown(canvas.worlds, canvas.film, samples, seed).reshape(2, -1, 3)[:, canvas.traced]
+        return thrown(canvas.worlds, canvas.film, samples, seed, place, len(canvas.traced))
 
     rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.stream + 2
     strategy, traced_light = STRATEGIES[effort.strategy], light if canvas.film is not None else None
@@ -233,9 +361,11 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
 
     Asked only where the samples still to come (``ahead``, of all pixels and one half) cost several times the answer.
     """
+    if halves.a.count.max() < TRUSTED:
+        return halves.open
     window = bounding_window(scattered(canvas, halves.open) > 0)
-    area = np.zeros(canvas.shape)[window].size
-    if halves.a.count.max() < TRUSTED or ahead < JUDGE_SAMPLES * area:
+    here = canvas.part[window].weight.shape
+    if ahead < JUDGE_SAMPLES * here[0] * here[1]:
         return halves.open
     images = planes_of(canvas, halves.both, JUDGED, window)
     composite = (images["obj"] + images["without"] + images["lost"] + images["gained"]).mean(-1)
@@ -243,30 +373,30 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
         noise = quieted(*halves_in(canvas, halves, images, window)).noise(tile_means(images["without"].mean(-1)))
     else:
         noise = np.sqrt(tile_means((images["obj_variance"] + images["change_variance"]).mean(-1)))
-    more = needs_more(noise, canvas.plate_sigma[window], tile_means(composite), canvas.white)
-    wanted = np.zeros(canvas.shape, bool)
-    inside = wanted[window]
-    inside[:] = np.repeat(np.repeat(more, TILE, 0), TILE, 1)[: inside.shape[0], : inside.shape[1]]
-    return wanted.ravel()[canvas.traced]
+    more = needs_more(noise, canvas.plate_sigma[canvas.window][window], tile_means(composite), canvas.white)
+    wanted = np.zeros(canvas.part.traced.shape, bool)
+    wanted[window] = np.repeat(np.repeat(more, TILE, 0), TILE, 1)[: here[0], : here[1]]
+    return wanted.ravel()[canvas.places]
 
 
 def scattered(canvas: Canvas, values: np.ndarray) -> np.ndarray:
-    """Values (N, ...) of the traced pixels as a picture (H, W, ...), zero elsewhere."""
-    image = np.zeros((canvas.shape[0] * canvas.shape[1], *values.shape[1:]), np.float32)
-    image[canvas.traced] = values
-    return image.reshape(*canvas.shape, *values.shape[1:])
+    """Values (N, ...) of the traced pixels as a picture of the canvas's window, zero elsewhere."""
+    height, width = canvas.part.traced.shape
+    image = np.zeros((height * width, *values.shape[1:]), np.float32)
+    image[canvas.places] = values
+    return image.reshape(height, width, *values.shape[1:])
 
 
 def planes_of(
-    canvas: Canvas, samples: Samples, names: tuple[str, ...], window: tuple[slice, slice]
+    canvas: Canvas, samples: Samples, names: tuple[str, ...], window: Window = WHOLE
 ) -> dict[str, np.ndarray]:
-    """The named fields as pictures of a window, and LS_noobj; the smooth part of the change is filled in."""
+    """The named fields as pictures of a window in the canvas's, and LS_noobj; the smooth part of the change is in."""
     images = {name: scattered(canvas, getattr(samples, name))[window] for name in names}
-    gap = canvas.region.interpolated[window]
+    region = canvas.part[window]
+    gap = region.interpolated
     images["albedo"][gap] = canvas.smooth_albedo[window][gap]
-    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)[window]
-    images["without"] = model = images["albedo"] * light / np.pi  # equation 7
-    region = canvas.region
+    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)[canvas.window][window]
+    images["without"] = model = images["albedo"] * np.asarray(light / np.pi, np.float32)  # equation 7
     fill = {
         "lost": (region.lost, model),
         "gained": (region.gained, model),
@@ -274,14 +404,14 @@ def planes_of(
     }
     for name, (relative, scale) in fill.items():
         if name in images:
-            images[name][gap] = relative[window][gap] * scale[gap]
+            images[name][gap] = relative[gap] * scale[gap]
     if "ground" in images:
         images["ground"][gap] = 1.0
     return images
 
 
 def halves_in(
-    canvas: Canvas, halves: Halves, images: dict[str, np.ndarray], window: tuple[slice, slice]
+    canvas: Canvas, halves: Halves, images: dict[str, np.ndarray], window: Window
 ) -> tuple[Half, Half, np.ndarray, np.ndarray, np.ndarray, float]:
     """What the denoiser wants to know of a window; ``images`` holds both halves' alpha and guides there."""
     parts = []
@@ -292,14 +422,14 @@ def halves_in(
 
 
 def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], QuietChange | None]:
-    """Every field as a picture (H, W, ...), zero where nothing was computed; and what the denoiser says of its work.
+    """Every field as a picture of the canvas's window, zero where nothing was computed; and what the denoiser says.
 
     It says nothing of fewer than `TRUSTED` samples.
     """
-    images = planes_of(canvas, halves.both, (*JUDGED, "ground"), (slice(None), slice(None)))
+    images = planes_of(canvas, halves.both, (*JUDGED, "ground"))
     if not canvas.effort.denoise:
         return images, None
-    window = bounding_window(canvas.region.traced)
+    window = bounding_window(canvas.part.traced)
     view = {name: image[window] for name, image in images.items()}
     given = halves_in(canvas, halves, view, window)
     quiet = None if halves.a.count.max() < TRUSTED else quieted(*given)
@@ -307,7 +437,7 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
         survives, added, obj = glimpsed(*given, fast=halves.passes == 1)
     else:
         survives, added, obj = quiet.survives.rgb, quiet.added.rgb, quiet.obj.rgb
-    here, model = canvas.region.traced[window][..., None], view["without"]
+    here, model = canvas.part.traced[window][..., None], view["without"]
     ground, shown = here & (model > 0), here & (view["alpha"][..., None] > 0)
     view["lost"][:] = np.where(ground, np.minimum(survives - 1, 0) * model, view["lost"])
     view["gained"][:] = np.where(ground, added * model, view["gained"])

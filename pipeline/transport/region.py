@@ -3,7 +3,8 @@
 A pilot estimates the change on cells of `CELL` pixels. Cells below the threshold are left to the plate. Where the
 change, relative to LS_noobj, bends so little from cell to cell that linear interpolation errs by less than the
 tolerance, the pilot itself is the answer (soft shadows far from the object are smooth); elsewhere every pixel is
-traced.
+traced. The pilot itself looks twice: a glance of two samples at every cell, and the whole only where blocks of 16 cells
+say that something changes or bounding spheres that it may, so that a large photograph costs what its changed part does.
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.transport.trace import Samples
+from pipeline.transport.scene import Worlds
+from pipeline.transport.trace import Rays, Samples
 
 CELL = 8  # px
+BLOCK = 4  # cells, side of the blocks that a glance is judged on
 BLUR = 0.8  # cells: less noise for a bias of a third of the second difference, which the tolerance bounds
+BLUR_NOISE = 1 / (4 * np.pi * BLUR**2)  # variance after that blur over the variance before
 FEATHER = 2 * CELL  # px over which the change fades out at the border of the region
 LEAST = 1e-4  # relative change below which a pilot's noise decides what is left out
+Window = tuple[slice, slice]  # rows and columns
+WHOLE: Window = (slice(None), slice(None))
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,10 @@ class Region:
         """(H, W) bool: changed, but smoothly."""
         return (self.weight > 0) & ~self.traced
 
+    def __getitem__(self, window: Window) -> Region:
+        """A part of it."""
+        return Region(**{name: values[window] for name, values in vars(self).items()})
+
 
 def cell_pixels(height: int, width: int) -> tuple[np.ndarray, tuple[int, int]]:
     """Flat index of the pixel in the middle of every cell, and the grid's size (rows, columns)."""
@@ -56,8 +66,88 @@ def cell_pixels(height: int, width: int) -> tuple[np.ndarray, tuple[int, int]]:
     return (rows[:, None] * width + columns).ravel(), (len(rows), len(columns))
 
 
+def near_objects(worlds: Worlds, rays: Rays) -> np.ndarray:
+    """(N,) bool: cells that may show an object, or on the plane the shadow of one in an emitter's light.
+
+    By the objects' bounding spheres, with a cell's width around them: what is too thin for few samples is in there.
+    """
+    length = np.linalg.norm(rays.centre, axis=1)
+    unit = rays.centre / length[:, None]
+    width = CELL * np.maximum(*(np.linalg.norm(by, axis=1) for by in (rays.by_x, rays.by_y))) / length  # [rad]
+    toward = unit @ worlds.plane.normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (worlds.plane.offset_m - rays.origin @ worlds.plane.normal) / toward
+    meets = np.isfinite(distance) & (distance > 0)
+    point = rays.origin + unit * np.where(meets, distance, 0)[:, None]
+    foot = width * np.where(meets, distance / np.abs(np.where(meets, toward, 1)), 0)  # of a cell on the plane [m]
+    near = np.zeros(len(rays), bool)
+    for *centre, radius in worlds.bounds:
+        offset = np.array(centre) - rays.origin
+        along = unit @ offset
+        aside = np.sqrt(np.maximum(offset @ offset - along**2, 0))
+        near |= (along > -radius) & (aside <= radius + width * np.linalg.norm(offset))
+        for lamp in (group.emitter for group in worlds.lights if group.emitter is not None):
+            along = (np.array(centre) - point) @ lamp.direction
+            aside = np.sqrt(np.maximum(((np.array(centre) - point) ** 2).sum(1) - along**2, 0))
+            reach = radius + foot + np.tan(lamp.half_angle_rad) * np.maximum(along, 0)
+            near |= meets & (along > -radius) & (aside <= reach)
+    return near
+
+
+def worth_a_look(
+    glance: Samples, model: np.ndarray, grid: tuple[int, int], limits: Limits, near: np.ndarray
+) -> np.ndarray:
+    """(cells,) bool: the cells that need more than a glance.
+
+    Blocks of `BLOCK` x `BLOCK` cells whose mean change is half the threshold or more, that show an object, or are
+    ``near`` (cells,) one; and the blocks around them, so that a block that is left out has missed in nine.
+
+    Args:
+        glance: few samples of every cell, in rows.
+        model: (cells, 3) expected LS_noobj of the cells.
+        grid: rows and columns of cells.
+        limits: what may be left out.
+        near: from `near_objects`.
+    """
+    from scipy.ndimage import binary_dilation
+
+    change = _relative(glance.lost + glance.gained, glance, model, grid)
+    certain = ((glance.alpha > 0) | near).reshape(*grid, 1)
+    wanted = (np.abs(block_means(change)) > limits.threshold / 2).any(-1) | (block_means(certain) > 0)[..., 0]
+    return over_blocks(binary_dilation(wanted, np.ones((3, 3))), grid).ravel()
+
+
+def block_means(cells: np.ndarray) -> np.ndarray:
+    """(r, c, K) means of (R, C, K) over blocks of `BLOCK` x `BLOCK` cells, those at the right and lower border cut."""
+    rows, columns = (np.arange(0, size, BLOCK) for size in cells.shape[:2])
+    total = np.add.reduceat(np.add.reduceat(cells.astype(float), rows, 0), columns, 1)
+    height, width = (
+        np.diff(np.append(start, size)) for start, size in zip((rows, columns), cells.shape[:2], strict=True)
+    )
+    return total / (height[:, None] * width)[..., None]
+
+
+def over_blocks(blocks: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Blocks (r, c, ...) repeated to cells (R, C, ...)."""
+    return np.repeat(np.repeat(blocks, BLOCK, 0), BLOCK, 1)[: grid[0], : grid[1]]
+
+
+def _usable(pilot: Samples, model: np.ndarray) -> np.ndarray:
+    return np.asarray(((model > 0).all(1) & (pilot.ground > 0.5))[:, None])
+
+
+def _relative(values: np.ndarray, pilot: Samples, model: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """(R, C, 3) values over LS_noobj, zero where that is not known."""
+    return np.divide(values, model, out=np.zeros(values.shape), where=_usable(pilot, model)).reshape(*grid, 3)
+
+
 def plan(
-    pilot: Samples, model: np.ndarray, grid: tuple[int, int], shape: tuple[int, int], limits: Limits
+    pilot: Samples,
+    model: np.ndarray,
+    grid: tuple[int, int],
+    shape: tuple[int, int],
+    limits: Limits,
+    glanced: np.ndarray | None = None,
 ) -> tuple[Region, dict[str, float]]:
     """Decide from a pilot on ``grid`` what to do with each of the ``shape`` (H, W) pixels.
 
@@ -67,19 +157,19 @@ def plan(
         grid: rows and columns of cells.
         shape: (H, W) of the photograph.
         limits: what may be left out, and how far interpolation may err.
+        glanced: (cells,) bool, the cells with so few samples that only the mean of their block says something.
 
     Returns the region, and what of the change is left out: the largest, the noise of that figure, and the mean over the
     frame, relative to LS_noobj.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
-    usable = ((model > 0).all(1) & (pilot.ground > 0.5))[:, None]
-
-    def field(values: np.ndarray) -> np.ndarray:
-        return np.divide(values, model, out=np.zeros_like(values), where=usable).reshape(*grid, 3)
-
-    lost, gained = field(pilot.lost), field(pilot.gained)
-    variance = np.divide(pilot.change_variance, model**2, out=np.zeros_like(model), where=usable).reshape(*grid, 3)
+    lost, gained = (_relative(values, pilot, model, grid) for values in (pilot.lost, pilot.gained))
+    variance = _relative(pilot.change_variance, pilot, model**2, grid)
+    if glanced is not None and glanced.any():
+        far = glanced.reshape(*grid, 1)
+        lost, gained = (np.where(far, over_blocks(block_means(values), grid), values) for values in (lost, gained))
+        variance = np.where(far, over_blocks(block_means(variance), grid) / BLOCK**2, variance)
     lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
     smoothed = gaussian_filter(lost + gained, (BLUR, BLUR, 0), mode="nearest")
     shown = pilot.alpha.reshape(grid) > 0
@@ -88,20 +178,36 @@ def plan(
     rough = np.maximum(bend(lost), bend(gained)) > limits.tolerance
     rough |= shown | (pilot.ground.reshape(grid) < 1)
     traced = changed & binary_dilation(rough, np.ones((3, 3)))
-    mask = enlarge(changed, shape)
-    weight = np.ones(shape)
     left = {"left_out_max": 0.0, "left_out_noise": 0.0, "left_out_mean": 0.0}
-    if not mask.all():
-        ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1)
-        weight = ramp * ramp * (3 - 2 * ramp)
+    if not changed.all():
         out = np.abs(smoothed[~changed])
         left = {
             "left_out_max": float(out.max()),
             "left_out_noise": float(np.sqrt(variance[~changed].max())),
             "left_out_mean": float(smoothed[~changed].sum() / smoothed.size),
         }
-    smooth = [interpolate(values, shape) for values in (lost, gained, variance)]
-    return Region(weight, enlarge(traced, shape) & (weight > 0), *smooth), left
+    # Only around what changes is there anything to compute: zeros cost nothing until they are read.
+    window = _around(changed, shape)
+    mask = enlarge(changed, shape, window)
+    fields = [np.zeros((*shape, 3), np.float32) for _ in range(3)]
+    for field, values in zip(fields, (lost, gained, variance), strict=True):
+        field[window] = interpolate(values, shape, window)
+    weight, everywhere = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1) if not mask.all() else np.ones(mask.shape)
+    weight[window] = ramp * ramp * (3 - 2 * ramp)
+    everywhere[window] = enlarge(traced, shape, window) & (weight[window] > 0)
+    return Region(weight, everywhere, *fields), left
+
+
+def _around(cells: np.ndarray, shape: tuple[int, int]) -> Window:
+    """Rows and columns of pixels around the cells (R, C) that are True, with two cells' margin."""
+    if not cells.any():
+        return slice(0, 0), slice(0, 0)
+    found = []
+    for axis, size in enumerate(shape):
+        there = np.flatnonzero(cells.any(1 - axis))
+        found.append(slice(max(there[0] - 2, 0) * CELL, min((there[-1] + 3) * CELL, size)))
+    return found[0], found[1]
 
 
 def limits_for(plate: np.ndarray, variance: np.ndarray, threshold: float) -> Limits:
@@ -131,18 +237,19 @@ def bend(values: np.ndarray) -> np.ndarray:
     return (down + across).max(-1) / 8
 
 
-def enlarge(cells: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Cells (R, C) repeated to pixels (H, W)."""
-    return np.repeat(np.repeat(cells, CELL, 0), CELL, 1)[: shape[0], : shape[1]]
+def enlarge(cells: np.ndarray, shape: tuple[int, int], window: Window = WHOLE) -> np.ndarray:
+    """Cells (R, C) repeated to the pixels of a window of (H, W)."""
+    rows, columns = (np.arange(size)[part] // CELL for size, part in zip(shape, window, strict=True))
+    return np.take(np.take(cells, rows, 0), columns, 1)
 
 
-def interpolate(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Cells (R, C, K) to pixels (H, W, K), linear between the cells' middle pixels, constant beyond."""
+def interpolate(values: np.ndarray, shape: tuple[int, int], window: Window = WHOLE) -> np.ndarray:
+    """Cells (R, C, K) to the pixels of a window of (H, W, K), linear between cells' middle pixels, constant beyond."""
     result = values
-    for axis, size in enumerate(shape):
+    for axis, (size, part) in enumerate(zip(shape, window, strict=True)):
         count = values.shape[axis]
         middle = np.minimum(np.arange(count) * CELL + CELL // 2, size - 1)
-        position = np.interp(np.arange(size), middle, np.arange(count))
+        position = np.interp(np.arange(size)[part], middle, np.arange(count))
         low = np.minimum(position.astype(int), max(count - 2, 0))
         share = (position - low).reshape([-1 if i == axis else 1 for i in range(3)])
         high = np.minimum(low + 1, count - 1)

@@ -27,7 +27,12 @@ class LightGroup:
 
     name: str
     scene: Any  # Mitsuba scene that holds only this light
-    compact: bool  # an emitter: its own samples suffice, no other technique would find it
+    emitter: Emitter | None = None  # None: the sky, or all light
+
+    @property
+    def compact(self) -> bool:
+        """An emitter: its own samples suffice, no other technique would find it."""
+        return self.emitter is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +127,13 @@ def light_groups(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter]) 
         alone = np.zeros_like(sky)
         alone[texels] = sky[texels]
         sky[texels] = 0.0
-        lamps.append(light_group(mi, emitter.name, alone.reshape(environment.shape), True))
-    return (light_group(mi, "sky", sky.reshape(environment.shape), False), *lamps)
+        lamps.append(light_group(mi, emitter.name, alone.reshape(environment.shape), emitter))
+    return (light_group(mi, "sky", sky.reshape(environment.shape)), *lamps)
 
 
-def light_group(mi: Any, name: str, radiance: np.ndarray, compact: bool) -> LightGroup:
+def light_group(mi: Any, name: str, radiance: np.ndarray, emitter: Emitter | None = None) -> LightGroup:
     """A scene with nothing but this light."""
-    return LightGroup(name, mi.load_dict({"type": "scene", "distant": environment_emitter(mi, radiance)}), compact)
+    return LightGroup(name, mi.load_dict({"type": "scene", "distant": environment_emitter(mi, radiance)}), emitter)
 
 
 def sky_above(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray) -> LightGroup:
@@ -136,7 +141,7 @@ def sky_above(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], nor
     sky = environment.copy()
     for emitter in emitters:
         sky.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0.0
-    return light_group(mi, "sky", above_plane(sky, normal), False)
+    return light_group(mi, "sky", above_plane(sky, normal))
 
 
 def ground_bsdf(mi: Any, albedo: np.ndarray, surface: Surface | None) -> dict[str, Any]:
@@ -207,7 +212,7 @@ def build_worlds(
         without_objects=without,
         local_with=local_with,
         lights=lights,
-        whole=light_group(mi, "all", environment, False),
+        whole=light_group(mi, "all", environment),
         lights_above=lights if proxies else (sky_above(mi, environment, emitters, plane.normal), *lights[1:]),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),

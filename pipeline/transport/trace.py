@@ -15,7 +15,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pipeline.camera.lens import rays_through
 from pipeline.transport.scene import Worlds
+from pipeline.types import Camera
 
 RAYS_PER_BLOCK = 1 << 21  # wavefront size: 30 floats per ray are kept until the samples of a pixel are summed
 NEVER = 1 << 20  # Russian roulette is left off: it adds noise to the difference of two paths
@@ -51,6 +53,23 @@ class Rays:
         """(N,) of the pixels [sr]."""
         area = np.abs((np.cross(self.by_x, self.by_y) * self.centre).sum(1))
         return area / np.linalg.norm(self.centre, axis=1) ** 3
+
+
+@dataclass(frozen=True, eq=False)
+class LensRays:
+    """The rays of a whole photograph, each made when it is asked for: of 24 million pixels few are traced."""
+
+    camera: Camera
+    world_from_camera: np.ndarray  # (4, 4)
+
+    def __getitem__(self, index: np.ndarray) -> Rays:
+        """Of the pixels with these flat indices (N,)."""
+        row, column = np.divmod(index, self.camera.width)
+        xn, dxn = rays_through(self.camera, np.stack([column, row], -1) + 0.5)
+        return Rays.of(self.world_from_camera, xn, dxn)
+
+    def __len__(self) -> int:
+        return self.camera.width * self.camera.height
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +134,10 @@ class Samples:
 
     def placed(self, index: np.ndarray, more: Samples) -> Samples:
         """``more`` samples of the pixels ``index`` added to those; the rest as they are."""
-        grown = self[index] + more
+        return self.replaced(index, self[index] + more)
+
+    def replaced(self, index: np.ndarray, grown: Samples) -> Samples:
+        """Other samples of the pixels ``index``; the rest as they are."""
         result = {}
         for f in fields(self):
             result[f.name] = getattr(self, f.name).copy()
