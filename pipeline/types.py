@@ -137,6 +137,8 @@ class BallFit(Record):
     rms_px: float
     points: int
     radius_px: float
+    reflectance: Array = np.ones(3)  # (3,) head on, ACEScg
+    edge_tint: Array | None = None  # (3,) of its angle dependence; None: the same at all angles
 
 
 class Plane(Record):

@@ -2,7 +2,7 @@
 
 Radiance is the pixel's over the ball's reflectance, as mirrors conserve radiance (Debevec 1998). The tripod's own
 photographer stays, as he stood there for the plate too; those of moved views give way to what other views see.
-Limits: light is taken as distant, so things at distance d are displaced by up to R/d; no Fresnel, dirt or dents.
+Limits: light is taken as distant, so things at distance d are displaced by up to R/d.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import latlong_solid_angles
-from pipeline.image.colour import Space, convert
 from pipeline.probes import combine, sphere_fit
+from pipeline.probes.ball_evidence import examine
+from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
 from pipeline.probes.observation import Grid, Observation, Shots, ViewMap, lookup_channels
 from pipeline.probes.reflection import blind_half_angle, radians_per_pixel
@@ -39,24 +40,26 @@ class MirrorBall:
             near = [ball.centre_world for ball in found.values()]
             found[name] = find_ball(name, photographs[name], plate, shots.camera_of(name), views[name], radius, near)
             warnings += complaints(name, found[name], radius)
-        space: Space = "linear_rec709" if facts["probe"].get("reflectance_space") == "linear_rec709" else "acescg"
-        reflectance = convert(np.array(facts["probe"]["reflectance"], float), space, "acescg")
+        known = examine(shots, found, radius, grid.rim)
+        warnings += known.warnings
         maps = {
             name: view_map(
-                photographs[name], shots.camera_of(name), views[name], found[name], radius, reflectance, grid
+                photographs[name], shots.camera_of(name), views[name], found[name], radius, known.surface, grid
             )
             for name in names
         }
         shade_photographers(maps, found, views, tripod)
         numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) for name in names}
-        balls = {name: ball_record(found[name].fit, radius) for name in (ball["name"] for ball in facts["ball"])}
+        balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
-        return Observation(maps, centre, balls, numbers, warnings, reasons(found, tripod))
+        evidence = [*reasons(found, tripod), *known.evidence]
+        return Observation(
+            maps, centre, balls, numbers | known.numbers, warnings, evidence, scale_sigma=known.surface.sigma
+        )
 
 
 def view_map(
-    photograph: Raster, camera: Camera, view: View, ball: Found, radius: float, reflectance: np.ndarray,
-    grid: Grid,
+    photograph: Raster, camera: Camera, view: View, ball: Found, radius: float, surface: Surface, grid: Grid
 ) -> ViewMap:  # fmt: skip
     """One view on the lat-long grid, with its weights."""
     height, width = grid.height, grid.width
@@ -68,6 +71,7 @@ def view_map(
     valid = unwrapped.values[..., 6]
     coverage = unwrapped.coverage * valid
     safe = np.where(valid > 0, valid, 1)[..., None]
+    reflectance = surface.at(unwrapped.sine)
     rgb = unwrapped.values[..., :3] / safe / reflectance
     photon = unwrapped.values[..., 3:6] / safe / reflectance**2
     sine = np.minimum(unwrapped.sine, 0.999)
@@ -151,11 +155,11 @@ def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def ball_record(fit: sphere_fit.SphereFit, radius: float) -> BallFit:
-    """The fit as it is stored."""
+def ball_record(fit: sphere_fit.SphereFit, radius: float, surface: Surface) -> BallFit:
+    """The fit as it is stored, with the reflectance that was used."""
     return BallFit(
         centre_camera_m=fit.centre, radius_m=radius, covariance=fit.covariance, rms_px=fit.rms_px, points=fit.points,
-        radius_px=fit.radius_px,
+        radius_px=fit.radius_px, reflectance=surface.facing, edge_tint=surface.tint,
     )  # fmt: skip
 
 
@@ -176,12 +180,6 @@ def reasons(found: dict[str, Found], tripod: set[str]) -> list[dict[str, Any]]:
             "modelled": len(found) > 1 and bool(moved),
             "because": "who moved was not there for the plate; who stood at the tripod was, and lights it",
             "could_cost": "one person's solid angle of wrong light",
-        },
-        {
-            "term": "Fresnel reflectance of the ball",
-            "modelled": False,
-            "because": "the manifest gives one reflectance per channel",
-            "could_cost": "1 to 3 % near the rim of chrome, 0 of an ideal mirror",
         },
         {
             "term": "parallax of near surfaces",

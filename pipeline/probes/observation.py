@@ -7,7 +7,7 @@ says what it does not see. The stage `probe` knows no kind: it levels views, mer
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,11 +48,26 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class Quality:
+    """What a view's geometry makes of the light, which its own noise does not enter: views are weighted by it.
+
+    ``sigma_rad`` (H, W): standard uncertainty of a texel's direction, with the blur of a pixel, NaN where blind;
+    ``pixels`` (H, W): pixels per texel, below 1 where it is enlarged; ``pixel_variance`` (H, W): of the noise of one
+    pixel, mean over the channels, radiance squared.
+    """
+
+    sigma_rad: np.ndarray
+    pixels: np.ndarray
+    pixel_variance: np.ndarray
+
+
+@dataclass(frozen=True)
 class ViewMap:
     """One view on the grid, world frame.
 
-    Radiance and variance (H, W, 3); weight (H, W), any unit; coverage (H, W) in [0, 1], how much of a texel was seen;
-    ``clipped`` (H, W) in [0, 1], how much of what was seen is clipped in every frame; zeros when not given.
+    Radiance and variance (H, W, 3); weight (H, W) in [0, 1], how far the view is to be trusted besides its variance;
+    coverage (H, W) in [0, 1], how much of a texel was seen; ``clipped`` (H, W) in [0, 1], how much of what was seen is
+    clipped in every frame; zeros when not given. Without ``quality`` the direction is exact and the variance is noise.
     """
 
     rgb: np.ndarray
@@ -60,10 +75,15 @@ class ViewMap:
     weight: np.ndarray
     coverage: np.ndarray
     clipped: np.ndarray | float = 0.0
+    quality: Quality | None = None
 
     def scaled(self, factor: float | np.ndarray) -> ViewMap:
         """The same view at ``factor`` times the exposure, a number or one per channel."""
-        return ViewMap(self.rgb * factor, self.variance * np.square(factor), self.weight, self.coverage, self.clipped)
+        square, known = np.square(factor), self.quality
+        return replace(
+            self, rgb=self.rgb * factor, variance=self.variance * square,
+            quality=known and replace(known, pixel_variance=known.pixel_variance * np.mean(square)),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,7 +92,8 @@ class Observation:
 
     ``maps``: view name -> map, the view to which others are levelled first; ``centre_world`` (3,): where the light was
     measured; ``balls``: fitted balls by view, empty for other kinds; ``numbers`` by view or name, ``warnings`` and
-    ``evidence`` as in `Result`.
+    ``evidence`` as in `Result`. ``scale_sigma`` (3,): relative standard uncertainty that all texels of all views share.
+    ``smooth_only``: directions are too poor for more than nine harmonics.
     """
 
     maps: dict[str, ViewMap]
@@ -81,6 +102,8 @@ class Observation:
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
+    scale_sigma: np.ndarray | float = 0.0
+    smooth_only: bool = False
 
 
 class Kind(Protocol):
