@@ -204,6 +204,15 @@ class Emitter(Record):
     texels: Indices  # (N,), flat indices (row * width + column) into the environment, ascending
 
 
+class Balance(Record):
+    """What brings a view to the plate's exposure and colour: gains on its ACEScg channels."""
+
+    gains: Array  # (3,), multiply the view's photograph by them
+    covariance: Array  # (3, 3) of the logarithms of the gains
+    references: list[str]  # names of those that gave them; empty: assumed
+    applied: bool  # whether they differ from 1 beyond their uncertainty; else the photograph is used as it is
+
+
 @dataclass(frozen=True)
 class Result:
     """What a stage's compute returns: outputs by name, measured numbers, warnings, and evidence for model choices."""

@@ -169,7 +169,10 @@ class CaptureFacts(Strict):
         twice = sorted({pose.view for pose in self.pose if [other.view for other in self.pose].count(pose.view) > 1})
         if twice:
             raise ValueError(f"pose.view {twice} has several [[pose]] tables; expected one per view")
-        for kind, tables in (("proxy", self.proxy), ("occluder", self.occluder)):
+        strange = sorted({seen.view for one in self.reference for seen in one.seen} - views)
+        if strange:
+            raise ValueError(f"reference.seen.view is {strange}; expected one of {sorted(views)}")
+        for kind, tables in (("proxy", self.proxy), ("occluder", self.occluder), ("reference", self.reference)):
             given = [table.name for table in tables]
             if len(set(given)) < len(given):
                 raise ValueError(f"{kind} names are {given}; each must be unique")
@@ -207,6 +210,51 @@ class MaterialWish(Strict):
 class ObjectWish(Strict):
     """One object and where it stands."""
 
+class SeenFacts(Strict):
+    """Where one view shows a reference."""
+
+    view: str
+    corners_px: list[tuple[Coordinate, Coordinate]] = Field(
+        min_length=3, max_length=64, description="in order, first pixel centre at (0.5, 0.5)"
+    )
+
+    @model_validator(mode="after")
+    def _convex(self) -> SeenFacts:
+        corners = self.corners_px
+        turns = []
+        for i, (x, y) in enumerate(corners):
+            (bx, by), (cx, cy) = corners[(i + 1) % len(corners)], corners[(i + 2) % len(corners)]
+            turns.append((bx - x) * (cy - by) - (by - y) * (cx - bx))
+        if not (min(turns) > 0 or max(turns) < 0):
+            raise ValueError("corners_px cross, coincide or turn inward; expected a convex outline, corner by corner")
+        return self
+
+
+class ReferenceFacts(Strict):
+    """A grey card, white card, 24-patch chart or grey ball that plate and balls show: it ties their colours."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    kind: Literal["grey_card", "white_card", "chart", "grey_ball"]
+    reflectance: tuple[Share, Share, Share] | None = Field(None, description="linear RGB; without it, neutral")
+    reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
+    seen: list[SeenFacts] = Field(min_length=1, description="one table per view that shows it")
+
+    @model_validator(mode="after")
+    def _shape(self) -> ReferenceFacts:
+        views = [seen.view for seen in self.seen]
+        if len(set(views)) < len(views):
+            raise ValueError(f"seen.view is {views}; expected each view once")
+        if self.kind == "chart" and self.reflectance is not None:
+            raise ValueError("reflectance: a chart's 24 patches are known; take it out")
+        if self.kind == "chart" and any(len(seen.corners_px) != 4 for seen in self.seen):
+            raise ValueError("corners_px: expected a chart's four corners: dark skin, bluish green, black, white")
+        if len({len(seen.corners_px) == 4 for seen in self.seen}) > 1:
+            raise ValueError("corners_px: four corners in one view, another outline in another; expected one kind")
+        if self.reflectance is not None and min(self.reflectance) <= 0:
+            raise ValueError(f"reflectance is {self.reflectance}; expected three numbers above 0")
+        return self
+
+
     name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
     file: str = Field(description=".glb, .obj or .ply; relative to scene.toml, else to the capture's root")
     position_m: tuple[float, float] = Field(description="x and z on the plane, world frame")
@@ -222,6 +270,7 @@ class SceneWishes(Strict):
     object: list[ObjectWish] = []
     quality: Literal["draft", "preview", "final"] = "preview"
 
+    reference: list[ReferenceFacts] = []
     @model_validator(mode="after")
     def _unique(self) -> SceneWishes:
         names = [wish.name for wish in self.object]
@@ -277,22 +326,29 @@ def known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def line_of(text: list[str], keys: list[str]) -> int | None:
-    """Line of the key in a TOML text, found by its table headings; None when it is not there."""
-    names = [key for key in keys if not key.isdigit()]
-    if not names:
-        return None
-    index = next((int(key) for key in keys if key.isdigit()), 0)
-    table, seen, heading = "", -1, None
+    """Line of the key in a TOML text, or of what holds it, found by its table headings; None when neither is there."""
+    names: list[str] = []
+    wanted: dict[str, int] = {}  # dotted name of an array of tables -> index
+    for key in keys:
+        if key.isdigit():
+            wanted.setdefault(".".join(names), int(key))
+        else:
+            names.append(key)
+    counts: dict[str, int] = {}
+    table, best, depth = [""], None, 0
     for number, line in enumerate(text, 1):
-        if match := re.match(r"\s*\[\[?\s*([\w.\-]+)\s*\]\]?", line):
-            table = match[1]
-            if table == names[0]:
-                seen += 1
-                if seen == index or heading is None:
-                    heading = number
+        if match := re.match(r"\s*\[(\[?)\s*([\w.\-]+)\s*\]\]?", line):
+            if match[1]:
+                counts = {name: count for name, count in counts.items() if not name.startswith(match[2] + ".")}
+                counts[match[2]] = counts.get(match[2], -1) + 1
+            found = table = match[2].split(".")
         elif match := re.match(r"\s*([\w\-]+)\s*=", line):
-            full = [*([part for part in table.split(".") if part]), match[1]]
-            if full == names and (seen == index or seen < 0 or "[[" not in "".join(text)):
+            found = [*filter(None, table), match[1]]
+        else:
+            continue
+        held = [".".join(found[: i + 1]) for i in range(len(found))]
+        if found == names[: len(found)] and all(counts[h] == wanted.get(h, 0) for h in held if h in counts):
+            if found == names:
                 return number
     return heading
 
