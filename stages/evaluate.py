@@ -140,8 +140,9 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float | None:
 def pose_errors(truth: Truth, camera: Camera, views: dict[str, View], balls: dict[str, BallFit]) -> dict[str, Any]:
     """Rotation [deg] and position [fraction of the distance to the ball] of every view, and of the plate by itself."""
     found: dict[str, Any] = {}
-    name, ball = next(iter(balls.items()))
-    target = transform_points(views[name].world_from_camera, ball.centre_camera_m)
+    target = np.zeros(3)  # without a ball the origin stands for the place of the objects
+    for name, ball in list(balls.items())[:1]:
+        target = transform_points(views[name].world_from_camera, ball.centre_camera_m)
     each = {}
     for view in views.keys() & truth.views.keys():
         true = truth.views[view]
@@ -200,7 +201,8 @@ def self_check(
 ) -> dict[str, Any]:  # fmt: skip
     """Predictions beside photographs. Every figure is a median relative (or absolute, for ratios) error."""
     probe = facts["probe"]
-    reflectance = convert(np.asarray(probe["reflectance"], float), probe["reflectance_space"], "acescg")
+    stated = probe.get("reflectance", (1.0, 1.0, 1.0)), probe.get("reflectance_space", "acescg")  # mirror balls' only
+    reflectance = convert(np.asarray(stated[0], float), stated[1], "acescg")
     light = environment.rgb()
     checks: dict[str, Any] = {"ball": {}, "shadow": {}}
     maps = {}

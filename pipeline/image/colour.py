@@ -79,6 +79,12 @@ def convert(rgb: np.ndarray, from_space: Space, to_space: Space) -> np.ndarray:
     return apply_matrix(matrix(from_space, to_space), rgb)
 
 
+def acescg_from_primaries(chromaticities: np.ndarray) -> np.ndarray:
+    """(3, 3) to ACEScg of a linear space given by the x, y of R, G, B, white (4, 2); white stays white (Bradford)."""
+    to_aces = adaptation(xyz_of_xy(chromaticities[3]), xyz_of_xy(ACESCG_CHROMATICITIES[3]))
+    return _from_xyz("acescg") @ to_aces @ xyz_from_rgb(chromaticities)
+
+
 def apply_matrix(target_from_source: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     """(..., 3) colours through a (3, 3) matrix; float32 stays float32."""
     rgb = np.asarray(rgb)
@@ -147,12 +153,6 @@ def camera_white(
     return current, white
 
 
-def acescg_from_camera(
-    color_matrix: np.ndarray | None,
-    as_shot_neutral: np.ndarray | None,
-    color_matrix_2: np.ndarray | None = None,
-    illuminant: int = 0,
-    illuminant_2: int = 0,
 def neutral_of_white(
     white: np.ndarray,
     color_matrix: np.ndarray,
@@ -170,6 +170,12 @@ def neutral_of_white(
     return np.asarray(neutral / neutral[1])
 
 
+def acescg_from_camera(
+    color_matrix: np.ndarray | None,
+    as_shot_neutral: np.ndarray | None,
+    color_matrix_2: np.ndarray | None = None,
+    illuminant: int = 0,
+    illuminant_2: int = 0,
     where: str = "camera colour",
 ) -> np.ndarray:
     """(3, 3) matrix from camera_rgb (black subtracted, *not* white balanced) to ACEScg, by the DNG colour matrices.

@@ -125,7 +125,9 @@ def checks(build: Build) -> list[dict[str, str]]:
 
 
 def ball_rows(build: Build) -> dict[str, Any] | None:
-    """Photographed ball, rendered ball, difference; one row per view."""
+    """Photographed ball, rendered ball, difference; one row per view. None for a probe that is no mirror ball."""
+    if not build.balls:
+        return None
     rows = []
     light, probe = build.environment.rgb(), build.facts["probe"]
     reflectance = convert(np.asarray(probe["reflectance"], float), probe["reflectance_space"], "acescg")

@@ -139,6 +139,56 @@ def _decode(path: Path) -> np.ndarray:
     return picture
 
 
+def read_latlong(path: Path) -> Raster:
+    """A lat-long map .exr or .hdr (Radiance): R G B as stored, finite or not; space ``unknown`` when not said.
+
+    Attributes of a Radiance header are ``exposure`` (1 when not said; radiance is the value over it) and, where given,
+    ``chromaticities``. Raises ArtifactError when the file cannot be read, has no colours, or is not twice as wide as
+    high.
+    """
+    if path.suffix.lower() == ".exr":
+        raster = read_exr(path)
+        names = ["R", "G", "B"] if {"R", "G", "B"} <= raster.channels.keys() else ["Y"] * 3
+        if not set(names) <= raster.channels.keys():
+            raise ArtifactError(f"{path}: channels are {', '.join(sorted(raster.channels))}; expected R G B or Y")
+        rgb = np.stack([raster.channels[name] for name in names], -1)
+        found = Raster(Raster.split(rgb), raster.space, raster.attributes)
+    else:
+        found = _read_radiance(path)
+    height, width = found.shape
+    if width != 2 * height:
+        raise ArtifactError(f"{path}: is {width} x {height}; expected a lat-long map, twice as wide as high; crop none")
+    return found
+
+
+def _read_radiance(path: Path) -> Raster:
+    """A Radiance picture: decoded by cv2, which drops the header's EXPOSURE and PRIMARIES lines; they are kept."""
+    import cv2
+
+    if not path.is_file():
+        raise ArtifactError(f"{path}: missing; expected a Radiance .hdr")
+    head = path.read_bytes()[:8192].split(b"\n\n", 1)[0].decode("latin-1").replace("\r", "")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the reason of a refusal is ours to say
+    try:
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
+        raise ArtifactError(f"{path}: not a readable Radiance .hdr: cut off or damaged; export it again, or as .exr")
+    attributes: dict[str, Any] = {"exposure": 1.0}
+    try:
+        for line in head.splitlines():
+            if line.startswith("EXPOSURE="):
+                attributes["exposure"] *= float(line.split("=")[1])
+            elif line.startswith("PRIMARIES="):
+                attributes["chromaticities"] = tuple(float(value) for value in line.split("=")[1].split())
+    except ValueError as error:
+        raise ArtifactError(f"{path}: its header says {line!r}, which is no number; export it again") from error
+    space = space_of_chromaticities(attributes.get("chromaticities")) or "unknown"
+    return Raster(Raster.split(np.ascontiguousarray(picture[..., ::-1])), space, attributes)
+
+
 def read_mask(path: Path) -> np.ndarray:
     """Coverage (H, W) float32 in [0, 1] of a mask picture, .png (8 or 16 bit) or .exr: 1 in front, 0 not.
 

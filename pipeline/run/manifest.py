@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from pipeline.run.errors import ManifestError
 
@@ -59,13 +59,80 @@ class BallFacts(Strict):
         return self
 
 
-class ProbeFacts(Strict):
-    """What stood in for the objects."""
+class MirrorBallFacts(Strict):
+    """A polished ball, photographed in the [[ball]] views."""
 
     kind: Literal["mirror_ball"] = "mirror_ball"
     diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
     reflectance: Rgb = Field((1.0, 1.0, 1.0), description="linear RGB reflectance of the ball")
     reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
+
+
+class GreyBallFacts(Strict):
+    """A matt ball, photographed in the [[ball]] views."""
+
+    kind: Literal["grey_ball"]
+    diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
+    albedo: tuple[Share, Share, Share] = Field((0.18, 0.18, 0.18), description="linear RGB albedo of the ball")
+    albedo_space: Literal["acescg", "linear_rec709"] = "acescg"
+    albedo_sigma_rel: Share = Field(0.03, description="relative standard uncertainty of the albedo")
+
+
+class LightFacts(Strict):
+    """What every kind that brings light from elsewhere than the plate's camera may state."""
+
+    position_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="where it was taken, world frame; it then shows the plane that the plate shows"
+    )
+    height_m: Length = Field(0.1, description="without position_m: it is taken as this far above the origin")
+    scale: Length | None = Field(None, description="plate's unit per unit of the file; None: solved")
+    scale_sigma_rel: Share = Field(0.05, description="relative standard uncertainty of the stated scale")
+    plane_albedo: Share | None = Field(None, description="mean albedo of the plane, to solve the scale from it")
+    plane_albedo_sigma_rel: Share = Field(0.1, description="relative standard uncertainty of plane_albedo")
+    sigma_rel: Share = Field(0.03, description="relative standard uncertainty of a texel, scale apart")
+    clipped_at: Length | None = Field(None, description="values from here on are lower bounds, in the file's unit")
+
+
+class MapFacts(LightFacts):
+    """A ready-made lat-long map, .hdr or .exr."""
+
+    kind: Literal["map"]
+    file: str = Field(description=".hdr or .exr, twice as wide as high; relative to capture.toml, else to root")
+    space: Literal["linear_rec709", "acescg"] | None = Field(
+        None, description="colour space; None: as the file says, else linear_rec709"
+    )
+    yaw_deg: Coordinate = Field(0.0, description="about +Y, counter-clockwise seen from above; 0: centre looks to +Z")
+    up: tuple[Coordinate, Coordinate, Coordinate] = Field((0.0, 1.0, 0.0), description="world's up in the map's frame")
+    orientation_sigma_deg: float = Field(1.0, ge=0, le=180, description="standard uncertainty of the stated rotation")
+
+    @model_validator(mode="after")
+    def _up_is_a_direction(self) -> MapFacts:
+        if sum(value * value for value in self.up) < 1e-12:
+            raise ValueError("up is (0, 0, 0); expected a direction")
+        return self
+
+
+PROBE_KINDS: dict[str, type[Strict]] = {
+    "mirror_ball": MirrorBallFacts, "grey_ball": GreyBallFacts, "map": MapFacts,
+}  # fmt: skip
+BALL_KINDS = ("mirror_ball", "grey_ball")
+
+
+def _probe_kind(value: Any) -> str | None:
+    """Name of the kind of a [probe] table; a table without one is a mirror ball's."""
+    kind = value.get("kind", "mirror_ball") if isinstance(value, dict) else getattr(value, "kind", None)
+    return kind if isinstance(kind, str) else None
+
+
+ProbeFacts = Annotated[
+    Annotated[MirrorBallFacts, Tag("mirror_ball")]
+    | Annotated[GreyBallFacts, Tag("grey_ball")]
+    | Annotated[MapFacts, Tag("map")],
+    Discriminator(
+        _probe_kind, custom_error_type="probe_kind",
+        custom_error_message="expected one of " + ", ".join(PROBE_KINDS),
+    ),
+]  # fmt: skip
 
 
 class BoardFacts(Strict):
@@ -140,13 +207,58 @@ class OccluderFacts(Strict):
     file: str = Field(description="mesh .glb .obj .ply, or mask .png .exr (1 = in front); relative to capture.toml")
 
 
+class SeenFacts(Strict):
+    """Where one view shows a reference."""
+
+    view: str
+    corners_px: list[tuple[Coordinate, Coordinate]] = Field(
+        min_length=3, max_length=64, description="in order, first pixel centre at (0.5, 0.5)"
+    )
+
+    @model_validator(mode="after")
+    def _convex(self) -> SeenFacts:
+        corners = self.corners_px
+        turns = []
+        for i, (x, y) in enumerate(corners):
+            (bx, by), (cx, cy) = corners[(i + 1) % len(corners)], corners[(i + 2) % len(corners)]
+            turns.append((bx - x) * (cy - by) - (by - y) * (cx - bx))
+        if not (min(turns) > 0 or max(turns) < 0):
+            raise ValueError("corners_px cross, coincide or turn inward; expected a convex outline, corner by corner")
+        return self
+
+
+class ReferenceFacts(Strict):
+    """A grey card, white card, 24-patch chart or grey ball that plate and balls show: it ties their colours."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    kind: Literal["grey_card", "white_card", "chart", "grey_ball"]
+    reflectance: tuple[Share, Share, Share] | None = Field(None, description="linear RGB; without it, neutral")
+    reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
+    seen: list[SeenFacts] = Field(min_length=1, description="one table per view that shows it")
+
+    @model_validator(mode="after")
+    def _shape(self) -> ReferenceFacts:
+        views = [seen.view for seen in self.seen]
+        if len(set(views)) < len(views):
+            raise ValueError(f"seen.view is {views}; expected each view once")
+        if self.kind == "chart" and self.reflectance is not None:
+            raise ValueError("reflectance: a chart's 24 patches are known; take it out")
+        if self.kind == "chart" and any(len(seen.corners_px) != 4 for seen in self.seen):
+            raise ValueError("corners_px: expected a chart's four corners: dark skin, bluish green, black, white")
+        if len({len(seen.corners_px) == 4 for seen in self.seen}) > 1:
+            raise ValueError("corners_px: four corners in one view, another outline in another; expected one kind")
+        if self.reflectance is not None and min(self.reflectance) <= 0:
+            raise ValueError(f"reflectance is {self.reflectance}; expected three numbers above 0")
+        return self
+
+
 class CaptureFacts(Strict):
     """capture.toml."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
     root: str = Field(".", description="where the photographs lie; relative to this file; environment variables expand")
     plate: PlateFacts
-    ball: list[BallFacts] = Field(min_length=1)
+    ball: list[BallFacts] = Field([], description="views of the ball, for the kinds that are one")
     probe: ProbeFacts
     board: BoardFacts | None = None
     marker: MarkerFacts | None = None
@@ -155,11 +267,16 @@ class CaptureFacts(Strict):
     exposure: list[ExposureFacts] = []
     proxy: list[ProxyFacts] = []
     occluder: list[OccluderFacts] = []
+    reference: list[ReferenceFacts] = []
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
 
     @model_validator(mode="after")
     def _consistent(self) -> CaptureFacts:
         names = [ball.name for ball in self.ball]
+        if self.probe.kind in BALL_KINDS and not names:
+            raise ValueError(f"ball: missing; probe.kind = {self.probe.kind} needs at least one [[ball]]")
+        if self.probe.kind not in BALL_KINDS and names:
+            raise ValueError(f"ball: probe.kind = {self.probe.kind} looks at no ball; take the [[ball]] tables out")
         if "plate" in names or len(set(names)) < len(names):
             raise ValueError(f"ball names are {names}; each must be unique and none may be 'plate'")
         views = {"plate", *names}
@@ -210,51 +327,6 @@ class MaterialWish(Strict):
 class ObjectWish(Strict):
     """One object and where it stands."""
 
-class SeenFacts(Strict):
-    """Where one view shows a reference."""
-
-    view: str
-    corners_px: list[tuple[Coordinate, Coordinate]] = Field(
-        min_length=3, max_length=64, description="in order, first pixel centre at (0.5, 0.5)"
-    )
-
-    @model_validator(mode="after")
-    def _convex(self) -> SeenFacts:
-        corners = self.corners_px
-        turns = []
-        for i, (x, y) in enumerate(corners):
-            (bx, by), (cx, cy) = corners[(i + 1) % len(corners)], corners[(i + 2) % len(corners)]
-            turns.append((bx - x) * (cy - by) - (by - y) * (cx - bx))
-        if not (min(turns) > 0 or max(turns) < 0):
-            raise ValueError("corners_px cross, coincide or turn inward; expected a convex outline, corner by corner")
-        return self
-
-
-class ReferenceFacts(Strict):
-    """A grey card, white card, 24-patch chart or grey ball that plate and balls show: it ties their colours."""
-
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    kind: Literal["grey_card", "white_card", "chart", "grey_ball"]
-    reflectance: tuple[Share, Share, Share] | None = Field(None, description="linear RGB; without it, neutral")
-    reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
-    seen: list[SeenFacts] = Field(min_length=1, description="one table per view that shows it")
-
-    @model_validator(mode="after")
-    def _shape(self) -> ReferenceFacts:
-        views = [seen.view for seen in self.seen]
-        if len(set(views)) < len(views):
-            raise ValueError(f"seen.view is {views}; expected each view once")
-        if self.kind == "chart" and self.reflectance is not None:
-            raise ValueError("reflectance: a chart's 24 patches are known; take it out")
-        if self.kind == "chart" and any(len(seen.corners_px) != 4 for seen in self.seen):
-            raise ValueError("corners_px: expected a chart's four corners: dark skin, bluish green, black, white")
-        if len({len(seen.corners_px) == 4 for seen in self.seen}) > 1:
-            raise ValueError("corners_px: four corners in one view, another outline in another; expected one kind")
-        if self.reflectance is not None and min(self.reflectance) <= 0:
-            raise ValueError(f"reflectance is {self.reflectance}; expected three numbers above 0")
-        return self
-
-
     name: str = Field(pattern=r"^[A-Za-z0-9_-]+$")
     file: str = Field(description=".glb, .obj or .ply; relative to scene.toml, else to the capture's root")
     position_m: tuple[float, float] = Field(description="x and z on the plane, world frame")
@@ -270,7 +342,6 @@ class SceneWishes(Strict):
     object: list[ObjectWish] = []
     quality: Literal["draft", "preview", "final"] = "preview"
 
-    reference: list[ReferenceFacts] = []
     @model_validator(mode="after")
     def _unique(self) -> SceneWishes:
         names = [wish.name for wish in self.object]
@@ -294,7 +365,8 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
     text = path.read_text().splitlines() if path.is_file() else []
     lines = []
     for item in error.errors(include_url=False):
-        keys = [*([prefix] if prefix else []), *[str(part) for part in item["loc"]]]
+        loc = [part for i, part in enumerate(item["loc"]) if not _is_tag(item["loc"], i)]
+        keys = [*([prefix] if prefix else []), *[str(part) for part in loc]]
         dotted = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(keys)) or model.__name__
         where = f"{path}:{number}" if (number := line_of(text, keys)) else str(path)
         if item["type"] == "extra_forbidden":
@@ -302,6 +374,9 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
             lines.append(f"{where}: {dotted}: unknown key" + (f"; did you mean {close[0]}?" if close else ""))
         elif item["type"] == "missing":
             lines.append(f"{where}: {dotted}: missing; it is required")
+        elif item["type"] == "probe_kind":
+            stated = item["input"].get("kind") if isinstance(item["input"], dict) else item["input"]
+            lines.append(f"{where}: probe.kind: is {stated!r}; {item['msg']}")
         else:
             message = item["msg"].removeprefix("Value error, ")
             found = "" if item["type"] == "value_error" else f"is {item['input']!r}; expected: "
@@ -309,11 +384,19 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
     return lines
 
 
+def _is_tag(loc: tuple[int | str, ...], at: int) -> bool:
+    """Whether a part of an error's place is no key but the kind of probe that pydantic chose."""
+    return at == 1 and loc[0] == "probe" and loc[1] in PROBE_KINDS
+
+
 def known_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Names of the fields of the model that ``loc`` points into."""
     current: Any = model
-    for part in loc:
+    for at, part in enumerate(loc):
         if isinstance(part, int):
+            continue
+        if _is_tag(loc, at):
+            current = PROBE_KINDS[str(part)]
             continue
         field = getattr(current, "model_fields", {}).get(part)
         if field is None:
@@ -350,7 +433,9 @@ def line_of(text: list[str], keys: list[str]) -> int | None:
         if found == names[: len(found)] and all(counts[h] == wanted.get(h, 0) for h in held if h in counts):
             if found == names:
                 return number
-    return heading
+            if len(found) > depth:
+                best, depth = number, len(found)
+    return best
 
 
 def load_capture(folder: Path) -> tuple[CaptureFacts, Path, Path]:
