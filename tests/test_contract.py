@@ -20,7 +20,7 @@ from stages.order import NAMES, graph
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/*.py")])
-ROOMS = [*NAMES, "simulate"]
+ROOMS = [*NAMES, "simulate", "ball"]
 LONGEST = 520  # lines; a file that one reads in one sitting
 
 # The composition roots: the only files outside stages/ that may know them.
@@ -30,6 +30,7 @@ KNOW_STAGES = {"pipeline/run/cli.py"}
 BRIDGES = {
     "cv2": {
         "pipeline/camera/opencv_bridge.py",
+        "pipeline/image/jpeg.py",
         "pipeline/light/sampling.py",
         "pipeline/run/formats.py",
         "pipeline/transport/denoise.py",  # its filters: 3 to 10 times quicker than those of scipy
@@ -55,6 +56,7 @@ BRIDGES = {
     "PIL": {
         "pipeline/run/formats.py",
         "pipeline/run/figures.py",
+        "pipeline/image/jpeg.py",
         "pipeline/image/pictures.py",
         "pipeline/simulation/capture.py",
     },

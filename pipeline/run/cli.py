@@ -76,6 +76,12 @@ def build_parser() -> argparse.ArgumentParser:
     simulate.add_argument("scene", type=Path, help="SCENE.toml")
     simulate.add_argument("folder", type=Path, help="folder of the new capture")
     simulate.add_argument("--spectral", action="store_true", help="no capture: compare RGB with spectra on this scene")
+    ball = verb("ball", closure.summary("stages.ball"), capture=False)
+    ball.add_argument("files", type=Path, nargs="+", help="photographs of the ball, cropped to it, one per exposure")
+    ball.add_argument("--out", type=Path, default=Path("ball.exr"), help="the map (default: ball.exr)")
+    ball.add_argument("--exposures", help="seconds, as 1/20,1/60,..., where the files' metadata lack them")
+    ball.add_argument("--distance-ratio", type=float, default=20.0, help="distance over radius of the ball (20)")
+    ball.add_argument("--width", type=int, default=1024, help="of the map [px]; its height is half (1024)")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
@@ -132,6 +138,11 @@ def dispatch(args: argparse.Namespace) -> int:
         from stages.simulate import simulate
 
         simulate(args.scene, args.folder, say)
+        return 0
+    if args.verb == "ball":
+        from stages.ball import ball
+
+        ball(args.files, args.out, args.exposures, args.distance_ratio, args.width, say)
         return 0
     if args.verb == "doctor":
         from pipeline.run.doctor import examine
