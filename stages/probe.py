@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
-from pipeline.probes import combine
+from pipeline.probes import combine, filling, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
 from pipeline.run.artifacts import BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS
@@ -32,16 +32,22 @@ def compute(
     maps, warnings = dict(observed.maps), list(observed.warnings)
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
-    rgb, variance, seen = combine.merge(list(maps.values()))
+    merged = combine.merge(list(maps.values()))
+    rgb, variance, seen = merged.rgb, merged.variance, merged.seen
     clipped = np.max([np.broadcast_to(view.clipped, seen.shape) for view in maps.values()], 0)
     lamp = clipped_numbers(rgb, clipped, seen, warnings)
-    rgb = combine.fill(rgb, np.minimum(seen * 4, 1) * (seen > 0))
-    variance = np.where(np.isfinite(variance) & (seen > 0)[..., None], variance, rgb**2)
-    rgb, variance, seen, laid = combine.lay_plate(
-        rgb, variance, seen, lookup_channels(photographs["plate"])[..., :7], camera,
+    known = np.minimum(seen * 4, 1)
+    rgb, variance, laid = combine.lay_plate(
+        rgb, variance, known, lookup_channels(photographs["plate"])[..., :7], camera,
         views["plate"].world_from_camera, observed.centre_world,
     )  # fmt: skip
-    numbers |= lamp | map_numbers(rgb, seen) | {"plane_from_plate_fraction": laid}
+    known, seen = np.maximum(known, laid), np.maximum(seen, laid)
+    gap = filling.prior(rgb, known)
+    rgb = filling.fill(rgb, known)
+    variance = filling.filled_variance(rgb, variance, known, gap)
+    numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
+    numbers |= combine.disagreement_numbers(merged) | filling.report(rgb, known, gap)
+    numbers |= lamp | map_numbers(rgb, seen)
     environment = Raster(
         {
             **Raster.split(rgb.astype(np.float32)),
@@ -63,14 +69,17 @@ def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str
     figures: dict[str, dict[str, float]] = {}
     applied = []
     names = list(maps)
-    for name in names[1:]:
-        ratio, sigma, disagreement = combine.relative_exposure(maps[names[0]], maps[name])
+    levels = levelling.level(list(maps.values()))
+    for number, name in enumerate(names[1:], 1):
+        ratio, sigma = float(np.exp(levels.log[number])), float(np.sqrt(levels.covariance[number, number]))
+        pair = levels.pairs.get((0, number))
         figures[name] = {
-            "exposure_ratio": ratio, "exposure_ratio_sigma": sigma, "overlap_disagreement_median_rel": disagreement,
+            "exposure_ratio": ratio, "exposure_ratio_sigma": ratio * sigma,
+            "overlap_disagreement_median_rel": pair.disagreement if pair else np.nan,
         }  # fmt: skip
-        if not np.isfinite(ratio):
+        if not np.isfinite(sigma):
             warnings.append(f"{name}: shares too few directions with {names[0]} to compare exposures; taken as equal")
-        elif abs(np.log(ratio)) > combine.SIGNIFICANT * sigma:
+        elif abs(levels.log[number]) > levelling.SIGNIFICANT * sigma:
             maps[name] = maps[name].scaled(1 / ratio)
             applied.append(name)
             warnings.append(f"{name}: {ratio:.3f} +- {ratio * sigma:.3f} times as bright as {names[0]}; brought to it")
@@ -110,7 +119,7 @@ def reasons(applied: list[str]) -> list[dict[str, Any]]:
         {
             "term": "relative exposure of views",
             "modelled": bool(applied),
-            "because": f"differs by more than {combine.SIGNIFICANT:.0f} sigma in {', '.join(applied) or 'no view'}",
+            "because": f"differs by more than {levelling.SIGNIFICANT:.0f} sigma in {', '.join(applied) or 'no view'}",
             "could_cost": "a seam of that ratio",
         },
         {

@@ -12,8 +12,11 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
 from pipeline.probes import reflection, sphere_fit
-from pipeline.probes.combine import fill, merge, relative_exposure, toward_photographer
+from pipeline.probes.combine import merge
+from pipeline.probes.filling import fill
+from pipeline.probes.levelling import relative_exposure
 from pipeline.probes.observation import ViewMap
+from pipeline.probes.photographer import toward_photographer
 from pipeline.probes.unwrap import samples_per_axis, unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
@@ -259,7 +262,8 @@ def test_one_view_marks_what_it_does_not_see(shots):
     hidden = environment["seen"] == 0
     assert hidden.any()
     relative = environment.rgb("variance")[hidden] / environment.rgb()[hidden] ** 2
-    assert relative.min() > 0.9  # unseen light is known to 100 %
+    measured = environment.rgb("variance")[~hidden] / environment.rgb()[~hidden] ** 2
+    assert relative.min() > 3 * np.median(measured)  # how well it is known, is tested in test_probe_views
 
 
 def test_clipped_lamp_is_a_lower_bound(shots):
@@ -366,10 +370,10 @@ def test_fill_keeps_constants_and_known_texels():
 def test_merge_of_equal_views_halves_the_variance():
     one = np.ones((8, 16))
     map_of = ViewMap(np.full((8, 16, 3), 2.0), np.full((8, 16, 3), 0.1), one, one)
-    rgb, variance, seen = merge([map_of, map_of])
-    assert rgb == pytest.approx(2)
-    assert variance == pytest.approx(0.05)
-    assert seen == pytest.approx(1)
+    merged = merge([map_of, map_of])
+    assert merged.rgb == pytest.approx(2)
+    assert merged.variance == pytest.approx(0.05)
+    assert merged.seen == pytest.approx(1)
 
 
 def test_relative_exposure_sees_through_a_moved_lamp():
@@ -378,6 +382,6 @@ def test_relative_exposure_sees_through_a_moved_lamp():
     other = 1.1 * base * (1 + 0.01 * rng.normal(size=base.shape))
     other[10:14, 20:26] = 500
     one = np.ones((64, 128))
-    ratio, sigma, _ = relative_exposure(ViewMap(base, base, one, one), ViewMap(other, other, one, one))
-    assert ratio == pytest.approx(1.1, rel=0.003)
-    assert sigma < 0.002
+    pair = relative_exposure(ViewMap(base, base, one, one), ViewMap(other, other, one, one))
+    assert np.exp(pair.log) == pytest.approx(1.1, rel=0.003)
+    assert pair.sigma < 0.002

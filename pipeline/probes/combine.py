@@ -1,10 +1,11 @@
-"""Several views of one ball, unwrapped on one lat-long grid, made one map: weights, relative exposure, gaps.
+"""Several views of one probe on one lat-long grid, made one map: weights, disagreement, the plate laid under.
 
-Weights are inverse variances of *where* a texel looked, not of its photons: photon variance follows the signal, so that
-weighting by it would prefer whichever view is darker wherever two views disagree, and lamps would lose energy.
+Views are weighted by the inverse of a variance that geometry and their common signal give, not their own noise.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,130 +13,155 @@ from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
-from pipeline.probes.observation import ViewMap
+from pipeline.probes.filling import enlarge
+from pipeline.probes.levelling import precision
+from pipeline.probes.observation import Quality, ViewMap
 from pipeline.types import Camera
 
-MOVED_PHOTOGRAPHER_WEIGHT = 1e-3  # another view wins wherever it sees; alone, the view still answers
-BODY_RADIUS_M, COLUMN_AZIMUTH, COLUMN_ABOVE, COLUMN_FOOT = 0.12, np.radians(16.0), np.radians(10.0), np.radians(-12.0)
-TEXTURE_SCALE = 0.02  # rad: finer displacements than this cost nothing; sets how steep the weights are
-CELL_ROWS = 16  # rows of the coarse grid on which views are compared: cells of 11 degrees
+WEIGHT_ROWS = 64  # rows of the grid on which views are weighed: cells of 2.8 degrees, wider than views are displaced
+FLOOR = 0.003  # relative: below it two views are equally good
 SIGNIFICANT = 3.0  # standard deviations
 
 
-def toward_photographer(height: int, width: int, to_camera: np.ndarray, distance: float) -> np.ndarray:
-    """Softness (H, W) in [0, 1]: 1 where camera or photographer hide the room, given the direction (3,) to the camera.
-
-    The camera is a disc of 0.12 m; the photographer a column 16 degrees to either side, from 10 degrees above it
-    down to 12 degrees below the horizon, where the table hides the rest. Edges fade over 2 degrees.
-    """
-    w = latlong_directions(height, width)
-    fade = np.radians(2.0)
-    body = np.arcsin(min(1.0, BODY_RADIUS_M / distance))
-    disc = _ramp(body - np.arccos(np.clip(w @ to_camera, -1, 1)), fade)
-    azimuth = np.arctan2(w[..., 0], w[..., 2]) - np.arctan2(to_camera[0], to_camera[2])
-    azimuth = np.abs(np.mod(azimuth + np.pi, 2 * np.pi) - np.pi)
-    elevation = np.arcsin(np.clip(w[..., 1], -1, 1))
-    top = np.arcsin(np.clip(to_camera[1], -1, 1)) + COLUMN_ABOVE
-    column = _ramp(COLUMN_AZIMUTH - azimuth, fade) * _ramp(top - elevation, fade) * _ramp(elevation - COLUMN_FOOT, fade)
-    return np.maximum(disc, column)
-
-
-def _ramp(inside: np.ndarray, fade: float) -> np.ndarray:
+def ramp(inside: np.ndarray, fade: float) -> np.ndarray:
     """0 below ``-fade``, 1 above 0, smooth between."""
     t = np.clip(inside / fade + 1, 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def angular_weight(sine: np.ndarray, sigma_rad: np.ndarray, rim: float) -> np.ndarray:
-    """Weight (H, W) of a view from the angular uncertainty of its texels; it fades to nothing at the rim cut."""
-    fade = _ramp(np.where(np.isfinite(sine), rim - sine, -1) - 0.04, 0.04)
-    return np.where(np.isfinite(sigma_rad), fade / (TEXTURE_SCALE**2 + sigma_rad**2), 0)
+def rim_fade(sine: np.ndarray, sigma_rad: np.ndarray, rim: float) -> np.ndarray:
+    """Trust (H, W) of a view in [0, 1]: nothing where it is blind, fading out over 0.04 before the rim cut at 0.04."""
+    fade = ramp(np.where(np.isfinite(sine), rim - sine, -1) - 0.04, 0.04)
+    return np.where(np.isfinite(sigma_rad), fade, 0)
 
 
-def relative_exposure(reference: ViewMap, other: ViewMap) -> tuple[float, float, float]:
-    """``other / reference`` in radiance: robust ratio, its relative standard uncertainty, and the median disagreement.
+@dataclass(frozen=True)
+class Merged:
+    """One map of several views: radiance and variance (H, W, 3), zero and infinite where nobody sees; seen (H, W).
 
-    Compared on cells of 11 degrees that both views see well, weighted by solid angle. Cells are taken as independent;
-    NaN where fewer than eight cells are shared.
+    ``disagreement`` (H, W): squared differences of views over those that their variances explain, at least 1 where one
+    view sees alone; ``share`` (V, H, W): weights that sum to 1.
     """
-    shared = np.minimum(_trust(reference), _trust(other))
-    height, width = CELL_ROWS, 2 * CELL_ROWS
-    area = resize_environment(shared[..., None], height, width)[..., 0]
-    means = [resize_environment(view.rgb * shared[..., None], height, width).mean(-1) for view in (reference, other)]
-    good = (area > 0.5) & (means[0] > 0) & (means[1] > 0)
-    if good.sum() < 8:
-        return np.nan, np.nan, np.nan
-    logarithm = np.log(means[1][good] / means[0][good])
-    weight = latlong_solid_angles(height, width)[good]
-    centre = _weighted_median(logarithm, weight)
-    spread = 1.4826 * _weighted_median(np.abs(logarithm - centre), weight)
-    effective = weight.sum() ** 2 / (weight**2).sum()
-    disagreement = _weighted_median(np.abs(logarithm - centre), weight)
-    return float(np.exp(centre)), float(1.2533 * spread / np.sqrt(effective)), float(disagreement)
+
+    rgb: np.ndarray
+    variance: np.ndarray
+    seen: np.ndarray
+    disagreement: np.ndarray
+    share: np.ndarray
 
 
-def _trust(view: ViewMap) -> np.ndarray:
-    """1 where a view is at least a tenth as good as at its best."""
-    return np.asarray(view.weight > 0.1 * view.weight.max(), float)
+def merge(views: list[ViewMap]) -> Merged:
+    """Mean of the views by the inverse of their variance; where they disagree beyond it, the variance is raised.
 
-
-def _weighted_median(values: np.ndarray, weight: np.ndarray) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def merge(views: list[ViewMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weighted mean of the views: radiance and variance (H, W, 3), zero and infinite where nobody sees; seen (H, W)."""
-    weights = np.stack([view.weight for view in views])
+    The variance that weighs is the same function of the same light for every view: pooled signal, its gradient and its
+    noise per pixel, with the view's own pixels per texel and direction error (see `expected_variance`). A view's own
+    variance follows its own signal, so weighting by it prefers the darker of two views that differ, and loses lamps.
+    """
+    trust = np.stack([view.weight for view in views])
+    weights = trust if len(views) == 1 else trust / expected_variance(views)
     total = weights.sum(0)
     share = weights / np.where(total > 0, total, 1)
-    rgb = np.einsum("vhw,vhwc->hwc", share, np.stack([view.rgb for view in views]))
-    variance = np.einsum("vhw,vhwc->hwc", share**2, np.stack([view.variance for view in views]))
+    rgb = sum_of(share, [view.rgb for view in views])
+    variance = sum_of(share**2, [view.variance for view in views])
+    ratio = disagreement(views, share, rgb, variance)
+    variance *= ratio[..., None]
     variance[total <= 0] = np.inf
     seen = np.einsum("vhw,vhw->hw", share, np.stack([view.coverage for view in views]))
-    return rgb, variance, np.clip(seen, 0, 1)
+    return Merged(rgb, variance, np.clip(seen, 0, 1), ratio, share)
 
 
-def fill(rgb: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Radiance (H, W, 3) with unknown texels taken from ever wider solid-angle means of known neighbours.
+def sum_of(share: np.ndarray, maps: list[np.ndarray]) -> np.ndarray:
+    """Sum (H, W, C) of maps (H, W, C) times shares (V, H, W)."""
+    return np.asarray(sum(part[..., None] * one for part, one in zip(share, maps, strict=True)), float)
 
-    ``known`` (H, W) in [0, 1]. A pyramid: each level halves the map, gaps take the interpolated coarser one (push-pull,
-    Gortler et al., The Lumigraph, 1996). Positive input gives positive output.
+
+def expected_variance(views: list[ViewMap]) -> np.ndarray:
+    """Variance (V, H, W) of each view, up to a common factor, as geometry and the pooled signal have it.
+
+    Noise of one pixel over pixels per texel, plus gradient times direction error squared, plus a floor. Evaluated on
+    cells of 2.8 degrees and interpolated: weights that varied across a lamp would weigh its two displaced pictures
+    differently, and change its energy.
     """
-    height, width = known.shape
-    if height <= 2 or width <= 4 or known.min() >= 1:
-        mean = (rgb * known[..., None]).sum((0, 1)) / max(float(known.sum()), 1e-12)
-        return known[..., None] * rgb + (1 - known[..., None]) * mean
-    small = ((height + 1) // 2, (width + 1) // 2)
-    weight = resize_environment(known[..., None], *small)
-    coarse = resize_environment(rgb * known[..., None], *small) / np.where(weight > 0, weight, 1)
-    coarse = fill(coarse, np.minimum(4 * weight[..., 0], 1))
-    return known[..., None] * rgb + (1 - known[..., None]) * _enlarge(coarse, height, width)
+    height, width = views[0].weight.shape
+    rows = min(WEIGHT_ROWS, height)
+    trust = np.stack([precision(view) for view in views])
+    pooled = sum_of(trust / np.where(trust.sum(0) > 0, trust.sum(0), 1), [view.rgb for view in views])
+    fine = resize_environment(pooled, min(4 * rows, height), 2 * min(4 * rows, height))
+    slope = resize_environment(gradient_per_radian(fine) ** 2, rows, 2 * rows).mean(-1)
+    signal = resize_environment(pooled, rows, 2 * rows).mean(-1)
+    noise, terms = [], []
+    for view in views:
+        known = view.quality or Quality(np.zeros(view.weight.shape), np.ones(view.weight.shape), view.variance.mean(-1))
+        area = np.asarray(view.weight > 0, float)
+        kept = [np.where(area > 0, one, 0) for one in (known.pixel_variance, known.sigma_rad**2, known.pixels)]
+        cells = np.moveaxis(resize_environment(np.stack([area, *kept], -1), rows, 2 * rows), -1, 0)
+        cells[1:] /= np.where(cells[0] > 0, cells[0], 1)
+        noise.append(np.where(cells[0] > 0, cells[1], np.nan))
+        terms.append((cells[2], np.maximum(cells[3], 1e-6)))
+    common = np.nan_to_num(_mean_of_known(np.stack(noise)))
+    model = []
+    for own, (sigma_squared, pixels) in zip(noise, terms, strict=True):
+        both = np.isfinite(own) & (common > 0) & (np.nan_to_num(own) > 0)
+        factor = float(np.median(own[both] / common[both])) if both.any() else 1.0
+        model.append(factor * common / pixels + slope * sigma_squared + (FLOOR * signal) ** 2 + 1e-30)
+    return np.moveaxis(enlarge(np.stack(model, -1), height, width), -1, 0)
 
 
-def _enlarge(rgb: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Bilinear enlargement, periodic in u."""
-    row = np.clip((np.arange(height) + 0.5) * rgb.shape[0] / height - 0.5, 0, rgb.shape[0] - 1)
-    column = (np.arange(width) + 0.5) * rgb.shape[1] / width - 0.5
-    top, left = np.floor(row).astype(int), np.floor(column).astype(int)
-    down, right = (row - top)[:, None, None], (column - left)[None, :, None]
-    below = np.minimum(top + 1, rgb.shape[0] - 1)
-    tall = rgb[top] * (1 - down) + rgb[below] * down
-    return tall[:, left % rgb.shape[1]] * (1 - right) + tall[:, (left + 1) % rgb.shape[1]] * right
+def _mean_of_known(values: np.ndarray) -> np.ndarray:
+    """Mean over the first axis of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(0)
+    return np.where(count > 0, np.where(known, values, 0).sum(0) / np.maximum(count, 1), np.nan)
+
+
+def disagreement(views: list[ViewMap], share: np.ndarray, rgb: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Squared differences from the mean over expected ones (H, W), on cells of 2.8 degrees, never below 1.
+
+    ``E (L_v - m)^2 = V_v (1 - 2 s_v) + V_m`` with shares ``s`` and the mean's variance ``V_m``. Only what exceeds 1 by
+    three standard deviations of so many independent pixels counts; a cell that one view sees alone keeps 1.
+    """
+    rows, squares, expected = min(WEIGHT_ROWS, rgb.shape[0]), 0.0, 0.0
+    pixels = np.zeros(rgb.shape[:2])
+    for part, view in zip(share, views, strict=True):
+        valid = (part > 0) & (part < 1)
+        allowed = (view.variance * (1 - 2 * part[..., None]) + variance).mean(-1)
+        squares = squares + part * np.where(valid, ((view.rgb - rgb) ** 2).mean(-1), 0)
+        expected = expected + part * np.where(valid, np.maximum(allowed, 0), 0)
+        pixels += np.where(valid, np.minimum(view.quality.pixels, 1) if view.quality else 1, 0) / len(views)
+    small = resize_environment(np.stack([squares, expected, pixels], -1), rows, 2 * rows)
+    ratio = np.where(small[..., 1] > 0, small[..., 0] / np.where(small[..., 1] > 0, small[..., 1], 1), 1)
+    count = small[..., 2] * rgb.shape[0] * rgb.shape[1] / (2 * rows * rows) * max(len(views) - 1, 1)
+    ratio = np.where(ratio > 1 + SIGNIFICANT * np.sqrt(2 / np.maximum(count, 1)), ratio, 1)
+    return enlarge(ratio[..., None], *rgb.shape[:2])[..., 0] if len(views) > 1 else np.ones(rgb.shape[:2])
+
+
+def disagreement_numbers(merged: Merged) -> dict[str, float]:
+    """How much of the sphere, and of the light, was seen twice and differently, and the root of the worst ratio."""
+    weight = latlong_solid_angles(*merged.seen.shape)
+    light = weight * merged.rgb.mean(-1)
+    several = merged.share.max(0) < 0.99
+    differs = (merged.disagreement > 1) & several
+    both = float((several * weight).sum())
+    return {
+        "seen_by_several_fraction": both / (4 * np.pi),
+        "disagreeing_fraction": float((differs * weight).sum()) / max(both, 1e-12),
+        "disagreeing_light_rel": float((differs * light).sum()) / max(float((several * light).sum()), 1e-300),
+        "disagreement_worst": float(np.sqrt(merged.disagreement.max())),
+    }
 
 
 def lay_plate(
-    rgb: np.ndarray, variance: np.ndarray, seen: np.ndarray, plate: np.ndarray, camera: Camera,
+    rgb: np.ndarray, variance: np.ndarray, known: np.ndarray, plate: np.ndarray, camera: Camera,
     world_from_camera: np.ndarray, centre: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Directions that meet the plane y = 0 near the ball show the plate's pixel there, not the ball's reflection.
 
     The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same
     plane, taken as diffuse, without it. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees down, fully from
-    11: within 8 radii of the foot. Returns radiance, variance, seen and the fraction of the sphere that was laid.
+    11: within 8 radii of the foot. ``known`` (H, W) in [0, 1] says how far the map is measured. Returns radiance,
+    variance, and the share (H, W) of the plate.
     """
-    height, width = seen.shape
+    height, width = known.shape
     w = latlong_directions(height, width)
     down = np.minimum(w[..., 1], -1e-6)
     foot = centre - w * (centre[1] / down)[..., None]
@@ -145,11 +171,13 @@ def lay_plate(
     size = np.array([camera.width, camera.height])
     inside = ((px > 1) & (px < size - 1)).all(-1)
     found = bilinear(planes(plate), np.where(inside, px[..., 0], 0), np.where(inside, px[..., 1], 0))
-    share = _ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
-    mixed = [share[..., None] * found[..., i : i + 3] for i in (0, 3)]
-    rest = 1 - share[..., None]
-    laid = float((share * latlong_solid_angles(height, width)).sum() / (4 * np.pi))
-    return mixed[0] + rest * rgb, share[..., None] * mixed[1] + rest**2 * variance, np.maximum(seen, share), laid
+    share = ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
+    rest = (1 - share) * known
+    total = np.where(share + rest > 0, share + rest, 1)
+    parts = [(weight / total)[..., None] for weight in (share, rest)]
+    mixed = parts[0] * found[..., :3] + parts[1] * rgb
+    spread = parts[0] ** 2 * found[..., 3:6] + parts[1] ** 2 * np.where(parts[1] > 0, variance, 0)
+    return mixed, spread, share
 
 
 def gradient_per_radian(rgb: np.ndarray) -> np.ndarray:

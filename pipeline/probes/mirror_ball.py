@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import latlong_solid_angles
-from pipeline.probes import combine, sphere_fit
-from pipeline.probes.ball_evidence import examine
+from pipeline.probes import combine, photographer, sphere_fit
+from pipeline.probes.ball_evidence import examine, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
-from pipeline.probes.observation import Grid, Observation, Shots, ViewMap, lookup_channels
+from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap, lookup_channels
 from pipeline.probes.reflection import blind_half_angle, radians_per_pixel
 from pipeline.probes.unwrap import samples_per_axis, unwrap
 from pipeline.types import BallFit, Camera, Raster, View
@@ -44,15 +44,22 @@ class MirrorBall:
         warnings += known.warnings
         maps = {
             name: view_map(
-                photographs[name], shots.camera_of(name), views[name], found[name], radius, known.surface, grid
+                without(photographs[name], known.dirty.get(name)),
+                shots.camera_of(name),
+                views[name],
+                found[name],
+                radius,
+                known.surface,
+                grid,
             )
             for name in names
         }
-        shade_photographers(maps, found, views, tripod)
-        numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) for name in names}
+        to_camera = {name: views[name].world_from_camera[:3, 3] - found[name].centre_world for name in names}
+        maps, people = photographer.shade(maps, to_camera, tripod)
+        numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) | people.get(name, {}) for name in names}
         balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
-        evidence = [*reasons(found, tripod), *known.evidence]
+        evidence = [*reasons(found), photographer.reason(people, len(maps)), *known.evidence]
         return Observation(
             maps, centre, balls, numbers | known.numbers, warnings, evidence, scale_sigma=known.surface.sigma
         )
@@ -81,9 +88,10 @@ def view_map(
     displaced = (gradient * np.where(np.isfinite(sigma), sigma, 0)[..., None]) ** 2
     variance = photon / np.maximum(pixels, 1)[..., None] + displaced
     blur = PIXEL_SIGMA * np.sqrt(per_pixel)
-    weight = combine.angular_weight(sine, np.hypot(sigma, blur), grid.rim) * coverage
+    trust = combine.rim_fade(sine, sigma, grid.rim) * coverage
     share = unwrapped.values[..., 7] / safe[..., 0] * (coverage > 0)
-    return ViewMap(rgb, variance, weight / (1 + 100 * share), coverage, share)
+    quality = Quality(np.hypot(sigma, blur), pixels, photon.mean(-1))
+    return ViewMap(rgb, variance, trust / (1 + 100 * share), coverage, share, quality)
 
 
 def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tuple[slice, slice], Camera]:
@@ -119,26 +127,6 @@ def angular_sigma(
     return np.sqrt(radial**2 * (shift + sine**2 * growth) + across**2 * shift + 2 * turn), radial * across
 
 
-def shade_photographers(
-    maps: dict[str, ViewMap], found: dict[str, Found], views: dict[str, View], tripod: set[str]
-) -> None:
-    """Lower the weight of moved views where their own camera and photographer stand, and where the tripod's stood.
-
-    The tripod's photographer was there for the plate and lights it: only the tripod's views show him.
-    """
-    hidden = {}
-    for name, view in maps.items():
-        to_camera = views[name].world_from_camera[:3, 3] - found[name].centre_world
-        distance = float(np.linalg.norm(to_camera))
-        height, width = view.weight.shape
-        hidden[name] = combine.toward_photographer(height, width, to_camera / distance, distance)
-    for name in set(maps) - tripod if len(maps) > 1 else ():
-        view = maps[name]
-        shade = np.max([hidden[other] for other in {name} | (tripod & set(maps))], 0)
-        lowered = view.weight * (1 - (1 - combine.MOVED_PHOTOGRAPHER_WEIGHT) * shade)
-        maps[name] = ViewMap(view.rgb, view.variance, lowered, view.coverage, view.clipped)
-
-
 def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
     """Figures of one fitted ball."""
     fit, distance = ball.fit, float(np.linalg.norm(ball.fit.centre))
@@ -163,9 +151,8 @@ def ball_record(fit: sphere_fit.SphereFit, radius: float, surface: Surface) -> B
     )  # fmt: skip
 
 
-def reasons(found: dict[str, Found], tripod: set[str]) -> list[dict[str, Any]]:
+def reasons(found: dict[str, Found]) -> list[dict[str, Any]]:
     """Which terms of the model are in, and why."""
-    moved = [name for name in found if name not in tripod]
     height = 1e3 * max(ball.height.sigma_m for ball in found.values())
     rim = 1e3 * max(float(np.sqrt(b.height.normal @ b.free.covariance @ b.height.normal)) for b in found.values())
     return [
@@ -176,21 +163,9 @@ def reasons(found: dict[str, Found], tripod: set[str]) -> list[dict[str, Any]]:
             "could_cost": "the distance from the rim alone: about 1 px of radius",
         },
         {
-            "term": "moved photographer removed, the tripod's kept",
-            "modelled": len(found) > 1 and bool(moved),
-            "because": "who moved was not there for the plate; who stood at the tripod was, and lights it",
-            "could_cost": "one person's solid angle of wrong light",
-        },
-        {
             "term": "parallax of near surfaces",
             "modelled": False,
             "because": "the room's distances are not measured",
             "could_cost": "directions off by R over distance, radiance unbiased",
-        },
-        {
-            "term": "photon noise in the view weights",
-            "modelled": False,
-            "because": "it follows the signal; views are weighted by how well they know the direction",
-            "could_cost": "less than the bias it would bring to lamps",
         },
     ]
