@@ -12,7 +12,7 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes import ball_surface
-from pipeline.probes.ball_pairs import Pairs, plane_pairs
+from pipeline.probes.ball_pairs import Pairs, Sight, plane_pairs
 from pipeline.probes.ball_surface import Measured, Surface, decide, measure
 from pipeline.transport.conductors import GRAZING, REFLECTANCE, preset, reflectance_at
 from pipeline.types import Camera
@@ -57,7 +57,7 @@ def traced(view: str) -> Pairs:
     place = Place(ROOM, plane=True, ball=BALL, reflectance=chrome)
     picture = photograph(place, CAMERA, POSES[view], 2, 0.003, 1)
     centre = transform_points(invert_rigid(POSES[view]), np.array(BALL))
-    return plane_pairs(channels(picture), CAMERA, POSES[view], centre, RADIUS)
+    return plane_pairs(Sight(channels(picture), CAMERA, POSES[view], centre, RADIUS))
 
 
 def pairs(mirror: str, view: str) -> Pairs:
@@ -131,9 +131,9 @@ def test_hidden_and_clipped_points_are_left_out():
     place = Place(ROOM, plane=True, ball=BALL)
     picture = channels(photograph(place, CAMERA, POSES["a"], 1))
     centre = transform_points(invert_rigid(POSES["a"]), np.array(BALL))
-    free = plane_pairs(picture, CAMERA, POSES["a"], centre, RADIUS)
+    free = plane_pairs(Sight(picture, CAMERA, POSES["a"], centre, RADIUS))
     picture[:, :150, 7] = 1  # the left third is clipped: neither seen directly nor in the ball
-    rest = plane_pairs(picture, CAMERA, POSES["a"], centre, RADIUS)
+    rest = plane_pairs(Sight(picture, CAMERA, POSES["a"], centre, RADIUS))
     assert 0 < len(rest) < len(free)
     assert rest.pixel[:, 0].min() >= 150
     behind = free.point - np.array(BALL) * (1, 0, 1)

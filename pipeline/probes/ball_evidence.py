@@ -8,40 +8,110 @@ from typing import Any
 import numpy as np
 
 from pipeline.image.colour import Space, convert
-from pipeline.probes import ball_surface
-from pipeline.probes.ball_pairs import Pairs, plane_pairs
-from pipeline.probes.ball_surface import Measured, Surface
+from pipeline.probes import ball_dirt
+from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, neighbourhood, pixel_step, plane_pairs
+from pipeline.probes.ball_surface import Measured, Surface, decide, measure, plane_blocks
 from pipeline.probes.finding import Found
-from pipeline.probes.observation import Shots, lookup_channels
+from pipeline.probes.observation import Shots
+from pipeline.transport.conductors import preset
+from pipeline.types import Raster
 
 
 @dataclass(frozen=True)
 class BallEvidence:
-    """The surface that is used, and all that was measured of the ball."""
+    """The surface that is used, the dirty pixels (H, W) of the views that have some, and what was measured."""
 
     surface: Surface
+    dirty: dict[str, np.ndarray] = field(default_factory=dict)
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
 
 
 def examine(shots: Shots, found: dict[str, Found], radius: float, rim: float) -> BallEvidence:
-    """Surface of the ball that was found in some views; ``rim``: outermost radius that is used, as a fraction."""
+    """The ball that was found in some views; ``rim``: outermost radius that is used, as a fraction."""
     facts = shots.facts["probe"]
-    pairs = {name: view_pairs(shots, name, ball, radius, rim) for name, ball in found.items()}
+    sights = {
+        name: neighbourhood(
+            shots.photographs[name], shots.camera_of(name), shots.views[name].world_from_camera, ball.fit.centre, radius
+        )
+        for name, ball in found.items()
+    }
+    pairs = {name: plane_pairs(sight, rim) for name, sight in sights.items()}
     given = given_reflectance(facts)
     material = facts.get("material")
-    tint = None if material is None else ball_surface.preset(material)[1]
-    measured = ball_surface.measure(list(pairs.values()), tint)
-    surface, warnings = ball_surface.decide(given, material, measured)
-    numbers = {"reflectance": surface_numbers(surface, given, measured)}
-    return BallEvidence(surface, numbers, warnings, surface_reasons(surface, measured))
+    tint = None if material is None else preset(material)[1]
+    measured = measure(list(pairs.values()), tint)
+    surface, warnings = decide(given, material, measured)
+    shapes = {name: shots.photographs[name].shape for name in found}
+    dirty, spots, tested = find_dirt(sights, pairs, measured, surface, rim, shapes, warnings)
+    numbers = {"reflectance": surface_numbers(surface, given, measured), "dirt": spots}
+    reasons = [*surface_reasons(surface, measured), dirt_reason(dirty, tested, measured)]
+    return BallEvidence(surface, dirty, numbers, warnings, reasons)
 
 
-def view_pairs(shots: Shots, name: str, ball: Found, radius: float, rim: float) -> Pairs:
-    """Pairs of one view."""
-    picture, world_from_camera = lookup_channels(shots.photographs[name]), shots.views[name].world_from_camera
-    return plane_pairs(picture, shots.camera_of(name), world_from_camera, ball.fit.centre, radius, rim)
+def find_dirt(
+    sights: dict[str, Sight], pairs: dict[str, Pairs], measured: Measured | None, surface: Surface, rim: float,
+    shapes: dict[str, tuple[int, int]], warnings: list[str],
+) -> tuple[dict[str, np.ndarray], dict[str, Any], int]:  # fmt: skip
+    """Masks of dirty pixels in the photographs (``shapes``), figures by view, and how many pixels were comparable."""
+    dirty, figures, compared = {}, {}, 0
+    marks = _plane_marks(pairs, measured)
+    for name, one in sights.items():
+        pixels = [pairs[name].pixel[marks[name]]]
+        compared += len(marks[name])
+        for other in sights.keys() - {name}:
+            shared, tested = ball_dirt.shared_spots(one, sights[other], surface, rim)
+            pixels.append(shared)
+            compared += tested
+        step = pixel_step(one)
+        mask = ball_dirt.spot_mask(np.unique(np.concatenate(pixels), axis=0), one.picture.shape[:2], step)
+        share = float(mask.sum() / (np.pi / 4 * len(ball_pixels(one)) * step**2))  # of the disc in its box
+        if share > ball_dirt.MOST:
+            warnings.append(
+                f"{name}: {share:.0%} of the ball is darker than predicted, too much for dirt; nothing is masked; is "
+                "probe.reflectance right, and the ball where the fit has it?"
+            )
+        elif mask.any():
+            dirty[name] = unbinned(mask, one, shapes[name])
+            figures[name] = {"pixels": int(dirty[name].sum()), "share_of_ball": share}
+            warnings.append(
+                f"{name}: {int(dirty[name].sum())} pixels of the ball ({share:.1%}) are dirty: darker than two "
+                "predictions of them; left out; wipe the ball"
+            )
+    return dirty, figures, compared
+
+
+def _plane_marks(pairs: dict[str, Pairs], measured: Measured | None) -> dict[str, np.ndarray]:
+    """Which pairs of each view are dirty by what the plane shows."""
+    if measured is None:
+        return {name: np.zeros(len(view), bool) for name, view in pairs.items()}
+    block = plane_blocks(list(pairs.values()))
+    marks, start = {}, 0
+    for name, view in pairs.items():
+        part = slice(start, start + len(view))
+        marks[name] = ball_dirt.plane_spots(view, measured.residual[part], measured.scale[part], block[part])
+        start += len(view)
+    return marks
+
+
+def unbinned(mask: np.ndarray, sight: Sight, shape: tuple[int, int]) -> np.ndarray:
+    """A mask of the sight's picture in the whole photograph (H, W)."""
+    large = np.kron(mask, np.ones((sight.binned, sight.binned), bool))
+    whole = np.zeros(shape, bool)
+    column, row = sight.corner
+    whole[row : row + large.shape[0], column : column + large.shape[1]] = large
+    return whole
+
+
+def without(photograph: Raster, mask: np.ndarray | None) -> Raster:
+    """A photograph whose masked pixels are unknown (NaN)."""
+    if mask is None:
+        return photograph
+    channels = dict(photograph.channels)
+    for name in "RGB":
+        channels[name] = np.where(mask, np.nan, channels[name]).astype(np.float32)
+    return Raster(channels, photograph.space, photograph.attributes)
 
 
 def given_reflectance(facts: dict[str, Any]) -> np.ndarray | None:
@@ -99,3 +169,13 @@ def surface_reasons(surface: Surface, measured: Measured | None) -> list[dict[st
         },
         angle,
     ]  # fmt: skip
+
+
+def dirt_reason(dirty: dict[str, np.ndarray], tested: int, measured: Measured | None) -> dict[str, Any]:
+    """Whether dirt is masked, and why."""
+    two = "the plane seen directly and the other view" if measured is not None else "the other view"
+    return {
+        "term": "dirt on the ball", "modelled": bool(dirty),
+        "because": f"{tested} comparisons with {two} show " + (f"spots in {', '.join(dirty)}" if dirty else "no spot"),
+        "could_cost": "the light behind a spot, as much as the spot swallows",
+    }  # fmt: skip

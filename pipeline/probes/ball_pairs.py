@@ -13,16 +13,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.lens import pixel_rays, project
-from pipeline.conventions import invert_rigid
+from pipeline.conventions import invert_rigid, transform_points
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes import sphere_fit
-from pipeline.types import Camera
+from pipeline.probes.observation import lookup_channels
+from pipeline.types import Camera, Raster
 
 SPLIT = 6  # rays per axis over the two pixels that a demosaicked pixel takes in
 MAX_ACROSS = 160  # pixels across the ball that are looked at: larger balls are looked at in steps
-NEAREST, FARTHEST = 1.3, 8.0  # distance from the foot, in radii: nearer, both are the contact's shadow
+NEAREST, FARTHEST = 1.3, 5.0  # distance from the foot, in radii: nearer is the contact's shadow, farther grazing
 BESIDE_PX = 4.0  # about the outline, where the direct picture may hold some of the ball
 LOOKUP_ROW = 1024
+AROUND = 2 * np.pi * np.arange(90) / 90
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One view of the ball: its picture (H, W, 8) as `lookup_channels` has it, lens, pose, centre in its frame [m].
+
+    The picture may be a part of the photograph, in larger pixels: ``corner`` column and row, and ``binned`` pixels.
+    """
+
+    picture: np.ndarray
+    camera: Camera
+    world_from_camera: np.ndarray
+    centre: np.ndarray
+    radius: float
+    corner: tuple[int, int] = (0, 0)
+    binned: int = 1
 
 
 @dataclass(frozen=True)
@@ -56,22 +74,48 @@ class Pairs:
         return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def plane_pairs(
-    picture: np.ndarray, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float,
-    limit: float = 0.97,
-) -> Pairs:  # fmt: skip
-    """Pairs of a photograph (H, W, 8) as `lookup_channels` gives it; ``centre`` (3,) in the camera frame, metres.
+def neighbourhood(
+    photograph: Raster, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float
+) -> Sight:
+    """The ball and the plane around it, as far as `FARTHEST`; binned when the ball is larger than needed."""
+    size = np.array([camera.width, camera.height])
+    outline = sphere_fit.silhouette(camera, centre, radius, AROUND)[0]
+    around = FARTHEST * radius * np.stack([np.cos(AROUND), 0 * AROUND, np.sin(AROUND)], -1)
+    local = transform_points(invert_rigid(world_from_camera), _foot(world_from_camera, centre) + around)
+    px = np.concatenate([outline, project(camera, local)])
+    px = np.clip(np.where(np.isfinite(px), px, 0), 0, size)  # what lies behind the camera: to the corner, at worst
+    binned = max(1, int((outline.max(0) - outline.min(0)).max() // MAX_ACROSS))
+    low = np.floor(px.min(0) / binned).astype(int) * binned
+    shape = (np.minimum(np.ceil(px.max(0)), size).astype(int) - low) // binned
+    high = low + shape * binned
+    found = lookup_channels(photograph, (slice(low[1], high[1]), slice(low[0], high[0])))
+    if binned > 1:
+        found = found.reshape(shape[1], binned, shape[0], binned, 8).mean((1, 3))
+        found[..., 3:6] /= binned**2
+    moved = {
+        "fx": camera.fx / binned, "fy": camera.fy / binned, "cx": (camera.cx - int(low[0])) / binned,
+        "cy": (camera.cy - int(low[1])) / binned, "width": int(shape[0]), "height": int(shape[1]),
+    }  # fmt: skip
+    return Sight(
+        found, camera.model_copy(update=moved), world_from_camera, centre, radius, (int(low[0]), int(low[1])), binned
+    )
+
+
+def plane_pairs(sight: Sight, limit: float = 0.97) -> Pairs:
+    """Pairs of one view.
 
     Left out: incidence beyond ``limit``, points nearer to or farther from the foot than a few radii, out of the frame,
     hidden by the ball, and whatever touches an invalid or clipped pixel. The way from the ball to the plane is free:
     a reflected ray leaves a sphere for good.
     """
-    px = _ball_pixels(camera, centre, radius)
+    picture, camera, world_from_camera = sight.picture, sight.camera, sight.world_from_camera
+    centre, radius = sight.centre, sight.radius
+    px = ball_pixels(sight)
     spread = ((np.arange(SPLIT) + 0.5) / SPLIT - 0.5) * 2  # +- 1 px about the centre
     dx, dy = (part.ravel() for part in np.meshgrid(spread, spread))
     share = (1 - np.abs(dx)) * (1 - np.abs(dy))
     share /= share.sum()
-    _, sine, point = mirrored_points(camera, world_from_camera, centre, radius, px + 0.5)
+    _, sine, _, point = ball_points(sight, px + 0.5)
     foot = _foot(world_from_camera, centre)
     near = np.linalg.norm((point - foot)[:, ::2], axis=-1) / radius
     keep = (sine < limit) & (near > NEAREST) & (near < FARTHEST)
@@ -79,7 +123,7 @@ def plane_pairs(
     if not len(px):
         return _none()
     fine = (px[:, None] + 0.5 + np.stack([dx, dy], -1)).reshape(-1, 2)
-    _, _, there = mirrored_points(camera, world_from_camera, centre, radius, fine)
+    _, _, _, there = ball_points(sight, fine)
     found, seen = _direct(picture, camera, world_from_camera, centre, radius, there)
     found = found.reshape(len(px), -1, 8)
     own = picture[px[:, 1], px[:, 0]].astype(float)
@@ -95,14 +139,14 @@ def plane_pairs(
     return Pairs(px, sine, point, own[:, :3], own[:, 3:6], direct, variance, texture, slope, tilt, azimuth).at(good)
 
 
-def mirrored_points(
-    camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float, px: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of pixels (N, 2): outward normal of the ball (N, 3) and mirrored point of y = 0 (N, 3), world; sine (N,).
+def ball_points(sight: Sight, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of pixels (N, 2), in the world: outward normal of the ball (N, 3), sine of the incidence (N,), reflected unit
+    direction (N, 3), and point of y = 0 that it meets (N, 3).
 
-    NaN where the ball is not hit, or does not mirror the plane.
+    NaN where the ball is not hit; the point also where the direction does not go down.
     """
-    rays = pixel_rays(camera, px)
+    centre, radius, world_from_camera = sight.centre, sight.radius, sight.world_from_camera
+    rays = pixel_rays(sight.camera, px)
     along = rays @ centre
     inside = along**2 - centre @ centre + radius**2
     hit = (along - np.sqrt(np.where(inside >= 0, inside, np.nan)))[:, None] * rays
@@ -113,18 +157,28 @@ def mirrored_points(
     start, away = hit @ rotation.T + position, away @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(away[:, 1] < 0, -start[:, 1] / away[:, 1], np.nan)
-    return normal @ rotation.T, sine, start + reach[:, None] * away
+    return normal @ rotation.T, sine, away, start + reach[:, None] * away
 
 
-def _ball_pixels(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Columns and rows (N, 2) of pixels about the ball, in steps when it is large."""
-    outline = sphere_fit.silhouette(camera, centre, radius, 2 * np.pi * np.arange(90) / 90)[0]
-    size = np.array([camera.width, camera.height])
-    low = np.clip(np.floor(outline.min(0)), 1, size - 2).astype(int)
-    high = np.clip(np.ceil(outline.max(0)), 1, size - 2).astype(int)
-    step = max(1, int(np.ceil((high - low).max() / MAX_ACROSS)))
+def ball_pixels(sight: Sight) -> np.ndarray:
+    """Columns and rows (N, 2) of pixels about the ball, `pixel_step` apart."""
+    low, high = _box(sight)
+    step = pixel_step(sight)
     columns, rows = np.arange(low[0], high[0] + 1, step), np.arange(low[1], high[1] + 1, step)
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+
+
+def pixel_step(sight: Sight) -> int:
+    """Every how many pixels a ball of this size is looked at."""
+    low, high = _box(sight)
+    return max(1, int(np.ceil((high - low).max() / MAX_ACROSS)))
+
+
+def _box(sight: Sight) -> tuple[np.ndarray, np.ndarray]:
+    outline = sphere_fit.silhouette(sight.camera, sight.centre, sight.radius, AROUND)[0]
+    size = np.array([sight.camera.width, sight.camera.height])
+    low = np.clip(np.floor(outline.min(0)), 1, size - 2).astype(int)
+    return low, np.clip(np.ceil(outline.max(0)), 1, size - 2).astype(int)
 
 
 def _foot(world_from_camera: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -81,7 +81,7 @@ def measure(views: list[Pairs], tint: np.ndarray | None = None) -> Measured | No
     foot, near and far, of each view), so what neighbouring pixels share is not counted twice.
     """
     whole = _joined(views)
-    block = _blocks(views)
+    block = plane_blocks(views)
     ratio, scale = _log_ratio(whole)
     usable = np.isfinite(scale).all(1) & (whole.slope > MIN_SLOPE)
     usable[np.flatnonzero(usable)[np.arange(usable.sum()) % max(1, -(-usable.sum() // MAX_PAIRS)) > 0]] = False
@@ -107,7 +107,7 @@ def _joined(views: list[Pairs]) -> Pairs:
     return Pairs(*(np.concatenate([getattr(v, name) for v in views]) for name in Pairs.__dataclass_fields__))
 
 
-def _blocks(views: list[Pairs]) -> np.ndarray:
+def plane_blocks(views: list[Pairs]) -> np.ndarray:
     """Number (M,) of the block of each pair: sector about the foot, near or far, view."""
     found = []
     for number, pairs in enumerate(views):
