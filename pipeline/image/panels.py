@@ -129,14 +129,13 @@ def ball_rows(build: Build) -> dict[str, Any] | None:
     if not build.balls:
         return None
     rows = []
-    light, probe = build.environment.rgb(), build.facts["probe"]
-    reflectance = convert(np.asarray(probe["reflectance"], float), probe["reflectance_space"], "acescg")
+    light = build.environment.rgb()
     for name, ball in build.balls.items():
         rows_at, columns = prediction.ball_crop(build.camera, ball, 1.15)
         photograph = build.photographs[name].rgb()[rows_at, columns]
         view = build.views[name].world_from_camera
         directions, sine = prediction.ball_directions(build.camera, ball, view, rows_at, columns)
-        predicted = prediction.mirrored_picture(light, directions, reflectance)
+        predicted = prediction.mirrored_picture(light, directions, prediction.ball_reflectance(ball, sine))
         inside = np.isfinite(sine)
         exposure = display_exposure(photograph[inside])
         shown = np.where(inside[..., None], predicted, photograph)

@@ -20,6 +20,7 @@ from pipeline.image.metrics import box
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.reflection import directions_from_rays
+from pipeline.transport.conductors import GRAZING, reflectance_at
 from pipeline.types import BallFit, Camera, Plane
 
 SHADOW_MAP = (64, 128)  # texels of the light that casts the ball's shadow: 2.8 deg, the ball is 20 deg and more
@@ -70,11 +71,20 @@ def ball_directions(
     return mirrored.reshape(*px.shape[:2], 3), sine.reshape(px.shape[:2])
 
 
+def ball_reflectance(ball: BallFit, sine: np.ndarray) -> np.ndarray:
+    """Reflectance (..., 3) of a ball under incidences of this ``sine`` (...); head on where it is NaN."""
+    if ball.edge_tint is None:
+        return np.broadcast_to(ball.reflectance, (*sine.shape, 3))
+    cosine = np.sqrt(np.clip(1 - np.nan_to_num(sine) ** 2, 0, 1))
+    at_edge = ball.reflectance + (1 - ball.reflectance) * (1 - GRAZING) ** 5
+    return reflectance_at(ball.reflectance, at_edge * ball.edge_tint, cosine)
+
+
 def mirrored_picture(environment: np.ndarray, directions: np.ndarray, reflectance: np.ndarray) -> np.ndarray:
     """The ball's picture (h, w, 3) from its directions (h, w, 3): map x reflectance; NaN outside the ball."""
     picture = np.full(directions.shape, np.nan, np.float32)
     inside = np.isfinite(directions[..., 0])
-    picture[inside] = lookup(environment, directions[inside]) * reflectance
+    picture[inside] = lookup(environment, directions[inside]) * np.broadcast_to(reflectance, directions.shape)[inside]
     return picture
 
 
