@@ -12,10 +12,11 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes import ball_surface
-from pipeline.probes.ball_pairs import Pairs, Sight, plane_pairs
+from pipeline.probes.ball_evidence import find_dirt, unbinned, without
+from pipeline.probes.ball_pairs import Pairs, Sight, ball_points, neighbourhood, plane_pairs
 from pipeline.probes.ball_surface import Measured, Surface, decide, measure
 from pipeline.transport.conductors import GRAZING, REFLECTANCE, preset, reflectance_at
-from pipeline.types import Camera
+from pipeline.types import Camera, Raster
 
 RADIUS = 0.04
 CAMERA = Camera(
@@ -210,3 +211,114 @@ def test_nothing_known_is_chrome_and_said():
     assert surface.facing == pytest.approx(REFLECTANCE["chromium"][0])
     assert (surface.sigma == 0.1).all()
     assert "neither given nor measurable" in warnings[0]
+
+
+# ---- dirt ----------------------------------------------------------------------------------------------------------
+
+SPOTS = {"below": (np.array([0.55, -0.25, 0.75]), 0.10), "above": (np.array([0.5, 0.75, 0.4]), 0.09)}
+
+
+def dirty(normal: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Half of the light is lost on two spots of the body."""
+    rgb = np.broadcast_to(TRUE, (*np.shape(cosine), 3)).copy()
+    for axis, size in SPOTS.values():
+        rgb[normal @ (axis / np.linalg.norm(axis)) > np.cos(size)] *= 0.5
+    return rgb
+
+
+@functools.cache
+def sights(spotted: bool) -> dict[str, Sight]:
+    place = Place(ROOM, plane=True, ball=BALL, reflectance=dirty if spotted else tuple(TRUE))
+    found = {}
+    for view, pose in POSES.items():
+        picture = photograph(place, CAMERA, pose, 2, 0.003, 3)
+        found[view] = Sight(
+            channels(picture), CAMERA, pose, transform_points(invert_rigid(pose), np.array(BALL)), RADIUS
+        )
+    return found
+
+
+def masks(spotted: bool, *views: str) -> tuple[dict[str, np.ndarray], list[str]]:
+    chosen = {view: sights(spotted)[view] for view in views}
+    pairs = {view: plane_pairs(sight) for view, sight in chosen.items()}
+    found = measure(list(pairs.values()))
+    warnings: list[str] = []
+    shapes = dict.fromkeys(views, (CAMERA.height, CAMERA.width))
+    dirt, _, _ = find_dirt(chosen, pairs, found, Surface(TRUE, np.zeros(3)), 0.97, shapes, warnings)
+    return dirt, warnings
+
+
+def true_mask(view: str, spot: str, grown: float) -> np.ndarray:
+    """(H, W) of the pixels on a spot, its radius grown [rad]."""
+    axis, size = SPOTS[spot]
+    y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
+    normal = ball_points(sights(True)[view], np.stack([x, y], -1).reshape(-1, 2) + 0.5)[0]
+    on = normal @ (axis / np.linalg.norm(axis)) > -1e-9 + np.cos(min(size + grown, np.pi))
+    return on.reshape(CAMERA.height, CAMERA.width)
+
+
+def test_a_clean_ball_has_no_dirt():
+    assert masks(False, "a", "b") == ({}, [])
+
+
+def test_dirt_is_found_by_two_views_and_by_the_plane():
+    dirt, warnings = masks(True, "a", "b")
+    assert set(dirt) == {"a", "b"}
+    assert len(warnings) == 2
+    for view, mask in dirt.items():
+        about = true_mask(view, "above", 0.0) | true_mask(view, "below", 0.0)
+        # The mask grows by a square of 4 px: 0.065 rad at its corners on 90 px, three times that towards the limb.
+        ball = true_mask(view, "above", 4.0)
+        assert not (mask & ball & ~(true_mask(view, "above", 0.2) | true_mask(view, "below", 0.2))).any(), view
+        assert (mask & about).sum() > 0.9 * about.sum(), view
+
+
+def test_one_view_finds_what_hides_the_plane_only():
+    dirt, _ = masks(True, "a")
+    assert (dirt["a"] & true_mask("a", "below", 0.0)).sum() > 0.5 * true_mask("a", "below", 0.0).sum()
+    assert not (dirt["a"] & true_mask("a", "above", 0.02)).any()
+
+
+def test_dirt_does_not_pull_the_reflectance():
+    found = measure([plane_pairs(sight) for sight in sights(True).values()])
+    assert found is not None
+    assert (np.abs(found.facing - TRUE) < 3 * found.sigma).all()
+
+
+def test_masked_pixels_are_unknown_and_the_rest_untouched():
+    mask = np.zeros((4, 6), bool)
+    mask[1, 2] = True
+    whole = Raster({**Raster.split(np.ones((4, 6, 3), np.float32)), "mask": np.zeros((4, 6), np.uint32)}, "acescg")
+    left = without(whole, mask)
+    assert np.isnan(left.rgb()[1, 2]).all()
+    assert np.isnan(left.rgb()).sum() == 3
+    assert without(whole, None) is whole
+
+
+def test_large_balls_are_looked_at_in_larger_pixels():
+    """Three times the pixels: the same pairs from pictures binned 3 x 3, and a mask that returns to them."""
+    camera = CAMERA.model_copy(
+        update={
+            "width": 1260, "height": 960, "fx": CAMERA.fx * 3, "fy": CAMERA.fy * 3, "cx": CAMERA.cx * 3,
+            "cy": CAMERA.cy * 3,
+        }
+    )  # fmt: skip
+    picture = photograph(Place(ROOM, plane=True, ball=BALL, reflectance=tuple(TRUE)), camera, POSES["a"], 1)
+    whole = Raster(
+        {
+            **Raster.split(np.float32(picture)), **Raster.split(np.float32(1e-6 * picture), "variance"),
+            "mask": np.zeros(picture.shape[:2], np.uint32),
+        },
+        "acescg",
+    )  # fmt: skip
+    centre = transform_points(invert_rigid(POSES["a"]), np.array(BALL))
+    sight = neighbourhood(whole, camera, POSES["a"], centre, RADIUS)
+    assert sight.binned == 3
+    found = measure([plane_pairs(sight)])
+    assert found is not None
+    assert found.facing == pytest.approx(TRUE, rel=0.003)  # one ray per pixel; as METHOD_SIGMA
+    mask = np.zeros(sight.picture.shape[:2], bool)
+    mask[5, 7] = True
+    rows, columns = np.nonzero(unbinned(mask, sight, picture.shape[:2]))
+    assert (rows.min(), rows.max()) == (sight.corner[1] + 15, sight.corner[1] + 17)
+    assert (columns.min(), columns.max()) == (sight.corner[0] + 21, sight.corner[0] + 23)
