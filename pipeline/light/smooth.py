@@ -29,6 +29,13 @@ def smooth_environment(rgb: np.ndarray) -> np.ndarray:
     return found
 
 
+def reduced(rgb: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`smooth_environment`, and its variance: what was left out, which may be anywhere, on every texel alike."""
+    found = smooth_environment(rgb)
+    weight = latlong_solid_angles(*rgb.shape[:2])[..., None] / (4 * np.pi)
+    return found, variance + ((rgb - found) ** 2 * weight).sum((0, 1))
+
+
 def _exponents(wanted: np.ndarray) -> np.ndarray:
     """Exponents (9,) of the map of most entropy with moments (9,), whose first is 1."""
     basis = sh9_basis(latlong_directions(ROWS, 2 * ROWS)).reshape(-1, 9)
