@@ -21,6 +21,7 @@ import numpy as np
 from pipeline.camera.rigid import difference
 from pipeline.conventions import transform_points
 from pipeline.image import metrics
+from pipeline.image.balance import balanced
 from pipeline.image.colour import convert
 from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
@@ -28,6 +29,7 @@ from pipeline.light import prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
 from pipeline.run.artifacts import (
     ALBEDO,
+    BALANCE,
     BALLS,
     CAMERA,
     COMPOSITE,
@@ -45,7 +47,7 @@ from pipeline.run.artifacts import (
 )
 from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
-from pipeline.types import BallFit, Camera, Plane, Raster, Result, View
+from pipeline.types import Balance, BallFit, Camera, Plane, Raster, Result, View
 from stages import knobs
 
 IRRADIANCE_MAP = (128, 256)  # truth and map are averaged to this before the irradiance: below 1e-4 for both
@@ -60,9 +62,10 @@ STRIDE = 2  # albedo is compared at every second pixel
 def compute(
     facts: dict[str, Any], wishes: dict[str, Any], photographs: dict[str, Raster], camera: Camera,
     views: dict[str, View], balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster,
-    layers: Raster, composite: Raster, records: dict[str, Any], params: knobs.Evaluate,
+    layers: Raster, composite: Raster, balance: dict[str, Balance], records: dict[str, Any], params: knobs.Evaluate,
 ) -> Result:  # fmt: skip
     """Metrics (empty without truth), self-check, and the error map (1x1 without truth)."""
+    photographs = balanced(photographs, balance)
     plate = photographs["plate"].rgb()
     checks = self_check(facts, photographs, camera, views, balls, environment, plane, albedo)
     same, fraction = metrics.untouched(composite.rgb(), plate, layers["influence"], layers["obj.A"])
@@ -207,8 +210,9 @@ def self_check(
     checks: dict[str, Any] = {"ball": {}, "shadow": {}}
     maps = {}
     for name, ball in balls.items():
-        rows, columns = prediction.ball_crop(camera, ball)
-        directions, sine = prediction.ball_directions(camera, ball, views[name].world_from_camera, rows, columns)
+        lens = views[name].camera or camera
+        rows, columns = prediction.ball_crop(lens, ball)
+        directions, sine = prediction.ball_directions(lens, ball, views[name].world_from_camera, rows, columns)
         photograph, bad = photographs[name].rgb()[rows, columns], photographs[name]["mask"][rows, columns] != 0
         used = (sine < BALL_LIMIT) & ~bad
         predicted = prediction.mirrored_picture(light, directions, reflectance)
@@ -216,7 +220,8 @@ def self_check(
         median = float(np.median(error)) if used.any() else None
         checks["ball"][name] = {"median_rel_err": median, "pixels": int(used.sum()), "in_sample": True}
         maps[name] = prediction.splat(directions[used], photograph[used], *PAIR_MAP)
-        if np.allclose(views[name].world_from_camera, views["plate"].world_from_camera, atol=1e-9):
+        stayed = np.allclose(views[name].world_from_camera, views["plate"].world_from_camera, atol=1e-9)
+        if stayed and views[name].camera is None:
             checks["shadow"][name] = shadow_check(
                 photographs, name, camera, views[name], ball, light, plane, reflectance
             )
@@ -332,7 +337,7 @@ STAGE = Stage(
     inputs={
         "facts": FACTS, "wishes": WISHES, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS, "balls": BALLS,
         "environment": ENVIRONMENT, "plane": PLANE, "albedo": ALBEDO, "layers": LAYERS, "composite": COMPOSITE,
-        "records": RECORDS,
+        "balance": BALANCE, "records": RECORDS,
     },
     outputs={"metrics": METRICS, "selfcheck": SELFCHECK, "error_map": ERROR_MAP},
 )  # fmt: skip

@@ -34,6 +34,10 @@ class Develop(Params):
     demosaic: Literal["bilinear", "malvar", "menon"] = Field("malvar", description="demosaicking method")
 
 
+class Balance(Params):
+    """No knobs: the references are facts."""
+
+
 class Calibrate(Params):
     """Intrinsics from board photographs."""
 
@@ -112,9 +116,9 @@ class Report(Params):
 
 
 KNOBS: dict[str, type[Params]] = {
-    "ingest": Ingest, "merge": Merge, "develop": Develop, "calibrate": Calibrate, "pose": Pose, "probe": Probe,
-    "lights": Lights, "plane": Plane, "reflectance": Reflectance, "render": Render, "composite": Composite,
-    "evaluate": Evaluate, "report": Report,
+    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "calibrate": Calibrate, "pose": Pose,
+    "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance, "render": Render,
+    "composite": Composite, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip
 
 # What each preset changes from the defaults above.

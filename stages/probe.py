@@ -12,21 +12,24 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
+from pipeline.image.balance import balanced
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import combine, filling, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
-from pipeline.run.artifacts import BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS
+from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Harmonics, Raster, Result, View
+from pipeline.types import Balance, Camera, Harmonics, Raster, Result, View
 from stages import knobs
 
 
 def compute(
-    facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, views: dict[str, View], params: knobs.Probe
-) -> Result:
+    facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, views: dict[str, View],
+    balance: dict[str, Balance], params: knobs.Probe,
+) -> Result:  # fmt: skip
     """Fitted balls, and the light at the probe (H, W) with H = width / 2, world frame."""
+    photographs = balanced(photographs, balance)
     grid = Grid(params.width, params.supersample, params.rim)
     observed = KINDS[facts["probe"]["kind"]].observe(Shots(facts, photographs, camera, views), grid)
     maps, warnings = dict(observed.maps), list(observed.warnings)
@@ -133,6 +136,6 @@ def reasons(applied: list[str]) -> list[dict[str, Any]]:
 
 STAGE = Stage(
     "probe", compute, knobs.Probe,
-    inputs={"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS},
+    inputs={"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS, "balance": BALANCE},
     outputs={"balls": BALLS, "environment": ENVIRONMENT, "harmonics": HARMONICS},
 )  # fmt: skip

@@ -13,10 +13,11 @@ import numpy as np
 
 from pipeline.image import figures as fig
 from pipeline.image import page, pictures
+from pipeline.image.balance import balanced
 from pipeline.image.panels import PARTS, TARGETS, Build, ball_rows, checks, light_of
 from pipeline.run import artifacts as A
 from pipeline.run.stage import Stage
-from pipeline.types import BallFit, Bracket, Camera, Harmonics, Plane, Raster, Result, View
+from pipeline.types import Balance, BallFit, Bracket, Camera, Harmonics, Plane, Raster, Result, View
 from stages import knobs
 
 HERO = 1600  # px at most, about, of the picture on top
@@ -24,6 +25,7 @@ TITLES = {
     "ingest": ("What was photographed", "Files by role, with what their metadata say."),
     "merge": ("Brackets to radiance", "Merged on the sensor's mosaic, each sample weighted by its noise."),
     "develop": ("Radiance to colour", "Demosaicked and brought to ACEScg by the camera's own matrices."),
+    "balance": ("One scale for all views", "Exposure and colour of each view against the plate's, by what both saw."),
     "calibrate": ("The lens", "Intrinsics and distortion from the board; terms are taken on held-out evidence."),
     "pose": (
         "Where the camera stood",
@@ -41,7 +43,7 @@ TITLES = {
     ),
 }
 COLOURS = ["#4c78a8", "#72b7b2", "#54a24b", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d", "#79706e", "#bab0ac",
-           "#2f6f8f", "#88b04b"]  # fmt: skip
+           "#2f6f8f", "#88b04b", "#d67195"]  # fmt: skip
 
 
 def compute(
@@ -49,9 +51,11 @@ def compute(
     exposures: dict[str, list[dict[str, Any]]], photographs: dict[str, Raster], camera: Camera, views: dict[str, View],
     balls: dict[str, BallFit], environment: Raster, harmonics: Harmonics, plane: Plane, albedo: Raster, layers: Raster,
     composite: Raster, display: np.ndarray, plate_display: np.ndarray, metrics: dict[str, Any],
-    selfcheck: dict[str, Any], error_map: Raster, records: dict[str, Any], params: knobs.Report,
+    selfcheck: dict[str, Any], error_map: Raster, balance: dict[str, Balance], records: dict[str, Any],
+    params: knobs.Report,
 ) -> Result:  # fmt: skip
     """The page as text."""
+    photographs = balanced(photographs, balance)
     build = Build(
         facts, wishes, brackets, exposures, photographs, camera, views, balls, environment, harmonics, plane, albedo,
         layers, composite, display, plate_display, metrics, selfcheck, error_map, records,
@@ -167,7 +171,8 @@ STAGE = Stage(
         "photographs": A.PHOTOGRAPHS, "camera": A.CAMERA, "views": A.VIEWS, "balls": A.BALLS,
         "environment": A.ENVIRONMENT, "harmonics": A.HARMONICS, "plane": A.PLANE, "albedo": A.ALBEDO,
         "layers": A.LAYERS, "composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY,
-        "metrics": A.METRICS, "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "records": A.RECORDS,
+        "metrics": A.METRICS, "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "balance": A.BALANCE,
+        "records": A.RECORDS,
     },
     outputs={"report": A.REPORT},
 )  # fmt: skip

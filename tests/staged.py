@@ -82,6 +82,7 @@ def artifacts() -> dict[str, Any]:
     }  # fmt: skip
     found["wishes"] = {"object": [{"name": "cube", "file": "cube.glb", "position_m": [0.1, 0.05]}], "quality": "draft"}
     found |= picture_with_object(photographs["plate"].rgb())
+    found["balance"] = {}
     found["records"] = {"merge": {"seconds": 1.5}, "render": {"seconds": 2.5}}
     return found
 

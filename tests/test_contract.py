@@ -205,13 +205,13 @@ def test_presets_set_existing_knobs_to_allowed_values():
 
 
 def test_every_artifact_is_written_once_and_read():
-    """Graph refuses two writers; here: every row is written, and only the page is read by no stage."""
+    """Graph refuses two writers; here: every row is written, and only page and CDL are read by no stage."""
     rows = {row.name: row for row in vars(artifacts).values() if isinstance(row, Artifact)}
     stages = graph().stages
     written = [artifact.name for stage in stages for artifact in stage.outputs.values()]
     read = {artifact.name for stage in stages for artifact in stage.inputs.values()}
     assert sorted([*written, "records"]) == sorted(rows)  # records come from the runner
-    assert set(written) - read == {"report"}
+    assert set(written) - read == {"report", "corrections"}
     for row in rows.values():
         assert row.meaning
         assert (row.type is not None) == (row.kind == "json")

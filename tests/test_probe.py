@@ -181,7 +181,7 @@ def run(shots: dict[str, Any], *balls: tuple[str, bool], width: int = 256):
     used = ["plate", *(name for name, _ in balls)]
     photographs = {name: shots["photographs"][name] for name in used}
     return probe.compute(
-        facts(*balls), photographs, shots["camera"], shots["views"], knobs.Probe(width=width, supersample=2)
+        facts(*balls), photographs, shots["camera"], shots["views"], {}, knobs.Probe(width=width, supersample=2)
     )
 
 

@@ -322,7 +322,7 @@ def test_probe_without_a_kind_is_a_mirror_ball():
 def stage_on(of: dict[str, Any], plate: Raster, **photographs: Raster) -> tuple[np.ndarray, Any]:
     """The whole stage on arrays: the environment's radiance (H, W, 3), and its result."""
     given = shots(of, plate, **photographs)
-    result = probe.compute(of, given.photographs, given.camera, given.views, knobs.Probe(width=128, supersample=2))
+    result = probe.compute(of, given.photographs, given.camera, given.views, {}, knobs.Probe(width=128, supersample=2))
     return result.outputs["environment"].rgb(), result
 
 

@@ -92,6 +92,21 @@ def display_transform(
     return coded
 
 
+def cdl_collection(slopes: dict[str, np.ndarray], descriptions: dict[str, str], space: str) -> str:
+    """An ASC CDL ColorCorrectionCollection (XML): by id, slopes (3,) on linear values of ``space``, with what they do.
+
+    Offset 0, power 1, saturation 1, so that a correction with the inverse slopes undoes it.
+    """
+    import PyOpenColorIO as ocio
+
+    chain = ocio.GroupTransform()
+    for name, slope in slopes.items():
+        cdl = ocio.CDLTransform(slope=[float(v) for v in slope], id=name, description=descriptions[name])
+        cdl.getFormatMetadata().addChildElement("InputDescription", f"scene-linear {space}")
+        chain.appendTransform(cdl)
+    return str(chain.write("ColorCorrectionCollection", config=ocio.Config.CreateRaw()))
+
+
 @lru_cache(maxsize=4)
 def _config(name: str) -> Any:
     import PyOpenColorIO as ocio

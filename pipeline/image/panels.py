@@ -70,6 +70,10 @@ class Build:
     error_map: Raster
     records: dict[str, Any]
 
+    def camera_of(self, view: str) -> Camera:
+        """The camera of a view: its own, else the plate's."""
+        return self.views[view].camera or self.camera
+
     @property
     def frame(self) -> tuple[int, int]:
         """(w, h) of the plate: the coordinates of everything drawn over it."""
@@ -131,10 +135,11 @@ def ball_rows(build: Build) -> dict[str, Any] | None:
     rows = []
     light = build.environment.rgb()
     for name, ball in build.balls.items():
-        rows_at, columns = prediction.ball_crop(build.camera, ball, 1.15)
+        camera = build.camera_of(name)
+        rows_at, columns = prediction.ball_crop(camera, ball, 1.15)
         photograph = build.photographs[name].rgb()[rows_at, columns]
         view = build.views[name].world_from_camera
-        directions, sine = prediction.ball_directions(build.camera, ball, view, rows_at, columns)
+        directions, sine = prediction.ball_directions(camera, ball, view, rows_at, columns)
         predicted = prediction.mirrored_picture(light, directions, prediction.ball_reflectance(ball, sine))
         inside = np.isfinite(sine)
         exposure = display_exposure(photograph[inside])
@@ -142,7 +147,7 @@ def ball_rows(build: Build) -> dict[str, Any] | None:
         below = luminance(photograph)
         difference = np.where(inside & (below > 0), luminance(predicted) / np.where(below > 0, below, 1) - 1, np.nan)
         corner = columns.start, rows_at.start
-        outline = fig.moved(fig.ball_outline(build.camera, ball), *corner)
+        outline = fig.moved(fig.ball_outline(camera, ball), *corner)
         rows.append([
             fig.photo(pictures.thumbnail(photograph, 400, exposure), f"{name}, photographed", "with the fitted outline",
                       lines=outline, size=(photograph.shape[1], photograph.shape[0])),
@@ -233,14 +238,16 @@ def pose_part(build: Build) -> dict[str, Any]:
         lines, labels = board_overlay(build, build.views[name], board)
         picture = build.plate_picture if name == "plate" else pictures.thumbnail(build.photographs[name].rgb(), WIDTH)
         caption = f"{build.views[name].route}, residual {fig.short(build.views[name].rms_px)} px"
-        shown.append(fig.photo(picture, name, caption, size=build.frame, lines=lines, labels=labels))
+        camera = build.camera_of(name)
+        size = camera.width, camera.height
+        shown.append(fig.photo(picture, name, caption, size=size, lines=lines, labels=labels))
     return {"figures": shown}
 
 
 def board_overlay(build: Build, view: View, board: dict[str, Any] | None) -> tuple[list[fig.Line], list[fig.Label]]:
     """The board's squares, and the world's axes at its origin."""
     side = board["square_m"] if board else 0.5 * (build.facts.get("marker") or {}).get("side_m", 0.1)
-    segments = []
+    segments, camera = [], view.camera or build.camera
     if board:
         x, z = np.array(board["squares"]) * side
         corners = np.array([[0, 0, 0], [x, 0, 0], [x, 0, z], [0, 0, z]], float)
@@ -249,9 +256,9 @@ def board_overlay(build: Build, view: View, board: dict[str, Any] | None) -> tup
     segments += [(np.zeros(3), tip, style) for tip, style in zip(tips, "xyz")]
     labels = []
     for tip, text in zip(1.15 * tips, ("+x", "+y", "+z")):
-        px = fig.world_pixel(build.camera, view.world_from_camera, tip)
+        px = fig.world_pixel(camera, view.world_from_camera, tip)
         labels += [fig.Label(float(px[0]), float(px[1]), text)] if np.isfinite(px).all() else []
-    return fig.world_lines(build.camera, view.world_from_camera, segments), labels
+    return fig.world_lines(camera, view.world_from_camera, segments), labels
 
 
 def probe_part(build: Build) -> dict[str, Any]:
@@ -280,7 +287,7 @@ def probe_part(build: Build) -> dict[str, Any]:
     seen = spheres.pictures(light.rgb(), build.harmonics.coefficients, view, SPHERE)
     exposure = display_exposure(build.photographs["plate"].rgb())
     for name, ball in list(build.balls.items())[:1]:
-        crop = build.photographs[name].rgb()[prediction.ball_crop(build.camera, ball, 1.02)]
+        crop = build.photographs[name].rgb()[prediction.ball_crop(build.camera_of(name), ball, 1.02)]
         shown.append(fig.photo(pictures.thumbnail(crop, SPHERE, exposure), name, "the ball as photographed"))
     shown += [
         fig.photo(pictures.thumbnail(picture, SPHERE, exposure), f"A {name} sphere", "in this light, from the plate")

@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.conventions import ACESCG, CAMERA_RGB, RADIANCE_UNIT
 from pipeline.run.stage import Artifact
-from pipeline.types import BallFit, Bracket, Camera, Emitter, Harmonics, Occluder, Plane, Proxy, Surface, View
+from pipeline.types import Balance, BallFit, Bracket, Camera, Emitter, Harmonics, Occluder, Plane, Proxy, Surface, View
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
@@ -31,6 +31,14 @@ EXPOSURES = Artifact(
     type=dict[str, list[dict[str, Any]]],
 )
 PHOTOGRAPHS = Artifact("photographs", "rasters", "developed view: R G B, variance.RGB, mask", RADIANCE_UNIT, ACESCG)
+
+BALANCE = Artifact(
+    "balance", "json", "gains that bring each view to the plate's exposure and colour, covariance", "1",
+    type=dict[str, Balance],
+)  # fmt: skip
+CORRECTIONS = Artifact(
+    "corrections", "cdl", "ASC CDL collection: every view's gains and their inverse; the plate made neutral, offered"
+)
 
 CAMERA = Artifact("camera", "json", "the plate's intrinsics, distortion, covariance", "px", type=Camera)
 VIEW_CAMERAS = Artifact("view_cameras", "json", "cameras of views that have their own", "px", type=dict[str, Camera])

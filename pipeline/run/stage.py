@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Artifact:
-    """One thing on disk. ``kind``: json, raster, rasters (a folder of EXR), picture (PNG) or page (HTML)."""
+    """One thing on disk. ``kind``: json, raster, rasters (a folder of EXR), picture (PNG), page (HTML) or cdl (XML)."""
 
     name: str
     kind: str
@@ -22,10 +22,8 @@ class Artifact:
     @property
     def filename(self) -> str:
         """Path below the stage's folder."""
-        suffix = {"records": "", "json": ".json", "raster": ".exr", "rasters": "", "picture": ".png", "page": ".html"}[
-            self.kind
-        ]
-        return self.name + suffix
+        suffixes = {"json": ".json", "raster": ".exr", "picture": ".png", "page": ".html", "cdl": ".ccc"}
+        return self.name + suffixes.get(self.kind, "")
 
 
 @dataclass(frozen=True)
