@@ -209,3 +209,37 @@ def first_calibration(
         board_from_camera[:3, 3] = -turn.T @ np.ravel(translation)
         poses.append(WORLD_FROM_BOARD @ board_from_camera)
     return camera, poses
+
+
+def feature_matches(picture: np.ndarray, others: list[np.ndarray], ratio: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Pixels of the same spots in one picture (H, W) uint8 and in each of the others: (N, 2) and (N, 2) per other.
+
+    SIFT (Lowe 2004); a match is kept when its second-best in ``picture`` is farther by 1 / ``ratio``, and when it is
+    the best both ways. Many are wrong: they are to be judged by geometry.
+    """
+    import cv2
+
+    finder: Any = cv2.SIFT.create(contrastThreshold=0.02, enable_precise_upscale=True)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    spots, ours_found = finder.detectAndCompute(np.ascontiguousarray(picture), None)
+    nothing = np.empty((0, 2)), np.empty((0, 2))
+    matches = []
+    for other in others:
+        there, theirs_found = finder.detectAndCompute(np.ascontiguousarray(other), None)
+        if ours_found is None or theirs_found is None or min(len(spots), len(there)) < 2:
+            matches.append(nothing)
+            continue
+        back = {m.queryIdx: m.trainIdx for m in matcher.match(ours_found, theirs_found)}
+        pairs = [
+            (best.trainIdx, best.queryIdx)
+            for best, second in matcher.knnMatch(theirs_found, ours_found, k=2)
+            if best.distance < ratio * second.distance and back[best.trainIdx] == best.queryIdx
+        ]
+        if not pairs:
+            matches.append(nothing)
+            continue
+        first, other_index = np.array(pairs).T
+        matches.append(
+            (ours(np.array([spots[i].pt for i in first])), ours(np.array([there[i].pt for i in other_index])))
+        )
+    return matches

@@ -80,7 +80,7 @@ def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
         (int(negative.sum()), "are negative in ACEScg; set to zero"),
     ):
         if count:
-            warnings.append(f"map: {count} texels {said}")
+            warnings.append(f"{probe['kind']}: {count} texels {said}")
     if plateau >= PLATEAU and not clipped.any():
         warnings.append(
             f"map: {plateau} texels share the largest value {largest:.6g}: if a lamp was clipped there, its light is a "
@@ -90,7 +90,7 @@ def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
         "size_px": [*raster.shape[::-1]], "space": space, "nan_texels": int(nan.sum()),
         "infinite_texels": int(infinite.sum()), "negative_texels": int(negative.sum()), "plateau_texels": plateau,
     }  # fmt: skip
-    return LatLong(np.maximum(rgb, 0), ~nan, clipped, numbers, warnings)
+    return LatLong(np.maximum(rgb, 0), np.logical_not(nan), clipped, numbers, warnings)
 
 
 def to_acescg(rgb: np.ndarray, raster: Raster, stated: str | None) -> tuple[np.ndarray, str]:

@@ -10,23 +10,13 @@ import os
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from pipeline.run.errors import ManifestError
-
-Rgb = tuple[float, float, float]
-Matrix4 = list[list[float]]
-Coordinate = Annotated[float, Field(allow_inf_nan=False)]
-Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-class Strict(BaseModel):
-    """Immutable, unknown keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+from pipeline.run.probe_facts import BALL_KINDS, PROBE_KINDS, ProbeFacts
+from pipeline.run.strict import Coordinate, Length, Matrix4, Rgb, Share, Strict
 
 
 class PlateFacts(Strict):
@@ -57,82 +47,6 @@ class BallFacts(Strict):
         if self.camera is not None and not self.camera.calibration and self.camera.given is None:
             raise ValueError("camera: neither calibration photographs nor given numbers")
         return self
-
-
-class MirrorBallFacts(Strict):
-    """A polished ball, photographed in the [[ball]] views."""
-
-    kind: Literal["mirror_ball"] = "mirror_ball"
-    diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
-    reflectance: Rgb = Field((1.0, 1.0, 1.0), description="linear RGB reflectance of the ball")
-    reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
-
-
-class GreyBallFacts(Strict):
-    """A matt ball, photographed in the [[ball]] views."""
-
-    kind: Literal["grey_ball"]
-    diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
-    albedo: tuple[Share, Share, Share] = Field((0.18, 0.18, 0.18), description="linear RGB albedo of the ball")
-    albedo_space: Literal["acescg", "linear_rec709"] = "acescg"
-    albedo_sigma_rel: Share = Field(0.03, description="relative standard uncertainty of the albedo")
-
-
-class LightFacts(Strict):
-    """What every kind that brings light from elsewhere than the plate's camera may state."""
-
-    position_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
-        None, description="where it was taken, world frame; it then shows the plane that the plate shows"
-    )
-    height_m: Length = Field(0.1, description="without position_m: it is taken as this far above the origin")
-    scale: Length | None = Field(None, description="plate's unit per unit of the file; None: solved")
-    scale_sigma_rel: Share = Field(0.05, description="relative standard uncertainty of the stated scale")
-    plane_albedo: Share | None = Field(None, description="mean albedo of the plane, to solve the scale from it")
-    plane_albedo_sigma_rel: Share = Field(0.1, description="relative standard uncertainty of plane_albedo")
-    sigma_rel: Share = Field(0.03, description="relative standard uncertainty of a texel, scale apart")
-    clipped_at: Length | None = Field(None, description="values from here on are lower bounds, in the file's unit")
-
-
-class MapFacts(LightFacts):
-    """A ready-made lat-long map, .hdr or .exr."""
-
-    kind: Literal["map"]
-    file: str = Field(description=".hdr or .exr, twice as wide as high; relative to capture.toml, else to root")
-    space: Literal["linear_rec709", "acescg"] | None = Field(
-        None, description="colour space; None: as the file says, else linear_rec709"
-    )
-    yaw_deg: Coordinate = Field(0.0, description="about +Y, counter-clockwise seen from above; 0: centre looks to +Z")
-    up: tuple[Coordinate, Coordinate, Coordinate] = Field((0.0, 1.0, 0.0), description="world's up in the map's frame")
-    orientation_sigma_deg: float = Field(1.0, ge=0, le=180, description="standard uncertainty of the stated rotation")
-
-    @model_validator(mode="after")
-    def _up_is_a_direction(self) -> MapFacts:
-        if sum(value * value for value in self.up) < 1e-12:
-            raise ValueError("up is (0, 0, 0); expected a direction")
-        return self
-
-
-PROBE_KINDS: dict[str, type[Strict]] = {
-    "mirror_ball": MirrorBallFacts, "grey_ball": GreyBallFacts, "map": MapFacts,
-}  # fmt: skip
-BALL_KINDS = ("mirror_ball", "grey_ball")
-
-
-def _probe_kind(value: Any) -> str | None:
-    """Name of the kind of a [probe] table; a table without one is a mirror ball's."""
-    kind = value.get("kind", "mirror_ball") if isinstance(value, dict) else getattr(value, "kind", None)
-    return kind if isinstance(kind, str) else None
-
-
-ProbeFacts = Annotated[
-    Annotated[MirrorBallFacts, Tag("mirror_ball")]
-    | Annotated[GreyBallFacts, Tag("grey_ball")]
-    | Annotated[MapFacts, Tag("map")],
-    Discriminator(
-        _probe_kind, custom_error_type="probe_kind",
-        custom_error_message="expected one of " + ", ".join(PROBE_KINDS),
-    ),
-]  # fmt: skip
 
 
 class BoardFacts(Strict):
@@ -166,7 +80,7 @@ class PoseFacts(Strict):
 
     view: str
     route: Literal["charuco", "marker", "points", "given"]
-    points: list[PointFacts] = []
+    points: list[PointFacts] = Field([])
     world_from_camera: Matrix4 | None = None
 
 
@@ -263,11 +177,11 @@ class CaptureFacts(Strict):
     board: BoardFacts | None = None
     marker: MarkerFacts | None = None
     camera: CameraFacts = CameraFacts()
-    pose: list[PoseFacts] = []
-    exposure: list[ExposureFacts] = []
-    proxy: list[ProxyFacts] = []
-    occluder: list[OccluderFacts] = []
-    reference: list[ReferenceFacts] = []
+    pose: list[PoseFacts] = Field([])
+    exposure: list[ExposureFacts] = Field([])
+    proxy: list[ProxyFacts] = Field([])
+    occluder: list[OccluderFacts] = Field([])
+    reference: list[ReferenceFacts] = Field([])
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
 
     @model_validator(mode="after")
@@ -339,7 +253,7 @@ class ObjectWish(Strict):
 class SceneWishes(Strict):
     """scene.toml, less the knobs of the stages (tables named after a stage, checked against stages/knobs.py)."""
 
-    object: list[ObjectWish] = []
+    object: list[ObjectWish] = Field([])
     quality: Literal["draft", "preview", "final"] = "preview"
 
     @model_validator(mode="after")
