@@ -237,7 +237,10 @@ def insitu(stage: Loaded, plate: np.ndarray, knobs: Render, seed: int, every: bo
     height, width = stage.scene.camera.height, stage.scene.camera.width
     picture = plate.reshape(height, width, 3)
     variance = (PLATE_NOISE * picture) ** 2
-    channels = Raster.split(picture) | Raster.split(variance, "variance")
+    channels = {
+        name: values.astype(np.float32)
+        for name, values in (Raster.split(picture) | Raster.split(variance, "variance")).items()
+    }
     photograph = Raster(channels | {"mask": np.zeros((height, width), np.uint32)}, "acescg")
     effort = Effort(samples=knobs.samples, depth=knobs.depth, denoise=True, seed=seed)
 

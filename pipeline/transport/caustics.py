@@ -88,7 +88,7 @@ def against_camera(worlds: Worlds, hit: Any, back: Any, light: Any) -> Any:
     return dr.select(leaving > 0, ratio, 0.0)
 
 
-def thrown(worlds: Worlds, film: Film, samples: int, seed: int, slot: Slot, slots: int) -> np.ndarray:
+def thrown(worlds: Worlds, film: Film, samples: float, seed: int, slot: Slot, slots: int) -> np.ndarray:
     """(2, slots, 3) radiance of the local scene, and of objects, by light that emitters send there by way of objects.
 
     Takes ``worlds.photons`` photons for each of ``samples`` samples of a pixel, for each emitter. Add it to what paths

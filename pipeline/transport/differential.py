@@ -26,7 +26,8 @@ the additive form's error, (k - 1) lost, against the noise that a ratio multipli
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -70,13 +71,13 @@ class Change:
         share = self.ground[..., None]
         return np.divide(self.without, share, out=np.zeros(self.without.shape), where=share > 0)
 
-    @property
+    @functools.cached_property
     def usable(self) -> np.ndarray:
         """(H, W, 3) bool: where LS_noobj is large enough to divide by."""
         share = self.ground[..., None]
         lit = self.without[self.ground > 0.5]
         floor = FAINT_MODEL * float(np.median(lit)) if lit.size else 0.0
-        return (self.without > floor * share) & (share > 0)
+        return np.asarray((self.without > floor * share) & (share > 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +100,11 @@ class Layers:
     alpha: np.ndarray
     guards: np.ndarray
 
-    @property
+    @functools.cached_property
     def touched(self) -> np.ndarray:
         """(H, W) bool: where the layers change anything."""
-        return (self.mul != 1).any(-1) | (self.add != 0).any(-1) | (self.obj != 0).any(-1)
+        changes = (self.mul != 1) | (self.add != 0) | (self.obj != 0)
+        return np.asarray(changes[..., 0] | changes[..., 1] | changes[..., 2])
 
     def apply(self, plate: np.ndarray) -> np.ndarray:
         """The composite (H, W, 3) float32; pixels that no layer touches keep the plate's own bits."""
@@ -182,11 +184,11 @@ def lost_share(change: Change, plate: np.ndarray, plate_variance: np.ndarray) ->
     the shadow out; and it would leave grain and hue in the layers. Only what keeps the result from turning negative is
     the pixel's own.
     """
-    has = (change.model > 0) & np.isfinite(plate_variance)
-    weight = np.where(has, change.ground[..., None], 0)
-    noise = np.where(has, plate_variance, 0) * weight**2
-    parts = (change.without, plate * weight, noise, -change.lost, _variances(change)[0])
-    n, p, b, lost, v = (_blocks(np.where(has, part, 0)) for part in parts)
+    share = change.ground[..., None]
+    has = (change.without > 0) & (share > 0) & np.isfinite(plate_variance)
+    variances = (np.where(has, plate_variance, 0) * share**2, _variances(change)[0] * has)
+    sums = (change.without * has, np.where(has, plate, 0) * share, -change.lost * has)
+    (n, p, lost), (b, v) = ([_blocks(part) for part in parts] for parts in (sums, variances))
     around = np.maximum(_surroundings(n), 1e-30)
     excess = _surroundings(p) / around - 1
     # Variances are of sums over blocks; what stays of the plate's in the surroundings is less by their 9 blocks.
@@ -199,18 +201,20 @@ def lost_share(change: Change, plate: np.ndarray, plate_variance: np.ndarray) ->
     height, width = plate.shape[:2]
     t = coarse.repeat(BLOCK_PX, 0).repeat(BLOCK_PX, 1)[:height, :width]
     # No less than what keeps the result from turning negative: LS_b (1 - t f) >= (1 - t) f N.
-    dark = change.ground[..., None] * np.maximum(plate, 0)
-    short = np.where(has, -change.lost - dark, 0)
-    at_risk = (short > 0) & (dark < change.without)
-    gap = np.where(at_risk, -change.lost * (1 - dark / np.where(at_risk, change.without, 1)), 1)
-    least = np.where(at_risk, short / gap, 0).max(-1, keepdims=True)
-    return np.broadcast_to(np.clip(np.maximum(t, least), 0, 1), plate.shape)
+    dark = share * np.maximum(plate, 0)
+    at_risk = has & (change.lost < -dark) & (dark < change.without)
+    if at_risk.any():
+        lost, dark, n = -change.lost[at_risk], dark[at_risk], change.without[at_risk]
+        least = np.zeros(plate.shape)
+        least[at_risk] = (lost - dark) / (lost * (1 - dark / n))
+        t = np.maximum(t, least.max(-1, keepdims=True))
+    return np.broadcast_to(np.clip(t, 0, 1), plate.shape)
 
 
 def picked(change: Change, row: np.ndarray, column: np.ndarray) -> Change:
     """Some pixels (N,) of a change, as a picture (N, 1)."""
-    parts = {name: values[row, column][:, None] for name, values in vars(change).items() if np.ndim(values)}
-    return replace(change, **parts)
+    whole = {f.name: getattr(change, f.name) for f in fields(change)}
+    return replace(change, **{name: values[row, column][:, None] for name, values in whole.items() if np.ndim(values)})
 
 
 def predicted_error(rule: Rule, change: Change, plate: np.ndarray, plate_variance: np.ndarray) -> np.ndarray:
@@ -277,10 +281,14 @@ def _parts(change: Change, lost: np.ndarray, gained: np.ndarray, rule: Rule) -> 
 
 def _blocks(values: np.ndarray) -> np.ndarray:
     """Sums (h, w, 3) over blocks of `BLOCK_PX`, what lies outside the frame counting as zero."""
-    height, width = (-(-size // BLOCK_PX) * BLOCK_PX for size in values.shape[:2])
-    padded = np.zeros((height, width, values.shape[2]))
-    padded[: values.shape[0], : values.shape[1]] = values
-    return padded.reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX, -1).sum((1, 3))
+    total = values
+    for axis in (0, 1):
+        summed = np.zeros([-(-size // BLOCK_PX) if i == axis else size for i, size in enumerate(total.shape)])
+        for offset in range(BLOCK_PX):
+            part = total[(slice(None),) * axis + (slice(offset, None, BLOCK_PX),)]
+            summed[tuple(slice(size) for size in part.shape)] += part
+        total = summed
+    return total
 
 
 def _surroundings(values: np.ndarray) -> np.ndarray:

@@ -37,7 +37,9 @@ from pipeline.transport.region import (
     Region,
     Window,
     cell_pixels,
+    in_pixels,
     near_objects,
+    of_cells,
     plan,
     worth_a_look,
 )
@@ -55,12 +57,13 @@ from pipeline.transport.trace import (
 
 STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": reference_block}
 PILOT_SHARE = 8  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
-MOST_PILOT = 512  # at first; where the pilot stands for pixels and is too noisy for it, all of its share
+FIRST_PILOT = 2  # likewise, before the first picture
+LEAST_PILOT, MOST_PILOT = 16, 512  # samples of a cell before the first picture
 GLANCE = 2  # samples of every cell; as many as the first pass takes, so that kernels are compiled once
 GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
-PILOT_PHOTONS = 2  # samples' worth
+PILOT_PHOTONS = 1 / 48  # samples' worth of photons over the pilot's samples of a cell
 PILOT_PIXELS = 1 << 20  # most pixels whose worth of photons a pilot takes
 WORTH_TRACING = 0.02  # of the added light: less of it in caustics is left to paths from the camera
 JUDGED = (
@@ -98,6 +101,7 @@ class Canvas:
     white: float  # radiance of display white
     effort: Effort
     film: Film | None = None  # where light tracing is worth its cost
+    pilot: Pilot | None = None  # what the region was made from
 
     @functools.cached_property
     def traced(self) -> np.ndarray:
@@ -178,19 +182,14 @@ def prepare(
         worlds = replace(worlds, photons=photons_for(worlds, min(shape[0] * shape[1], PILOT_PIXELS)))
     pilot = looked(worlds, rays, shape, light, limits, effort, film, tell("render: pilot"))
     region, left = plan(pilot.samples, pilot.model, pilot.grid, shape, limits, pilot.glanced)
-    if effort.adaptive and effort.strategy == "difference":
-        noisy = pilot.too_noisy(region, limits)
-        if len(noisy) and (more := PILOT_SHARE * effort.samples - pilot_samples(effort)) > 0:
-            pilot = pilot.refined(worlds, noisy, more, effort, tell("render: soft shadows"))
-            region, left = plan(pilot.samples, pilot.model, pilot.grid, shape, limits, pilot.glanced)
-    else:
+    if effort.strategy == "reference" or not effort.adaptive:
         region = replace(region, traced=region.weight > 0)
     share = float(pilot.thrown.sum() / max(pilot.samples.gained.sum(), 1e-30))
     if share < WORTH_TRACING:
         film, worlds = None, replace(worlds, photons=0.0)
     if film is not None:
         worlds = replace(worlds, photons=photons_for(worlds, int(region.traced.sum())))
-    canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort, film)
+    canvas = Canvas(worlds, rays, shape, region, light, plate_sigma, white, effort, film, pilot)
     return lit(canvas, worlds, light, tell), left | {"light_traced_share": share}
 
 
@@ -213,6 +212,7 @@ def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda w
 class Pilot:
     """What is known of the cells before any pixel is traced: those that are ``glanced`` at have `GLANCE` samples."""
 
+    worlds: Worlds
     rays: Rays  # of the cells
     samples: Samples  # thrown light in it
     model: np.ndarray  # (cells, 3) expected LS_noobj
@@ -220,27 +220,36 @@ class Pilot:
     glanced: np.ndarray  # (cells,) bool
     grid: tuple[int, int]
     index: np.ndarray  # (cells,) flat index of the pixel in the middle
+    tolerance: float  # relative to LS_noobj, see `Limits`
 
-    def too_noisy(self, region: Region, limits: Limits) -> np.ndarray:
-        """Indices of the cells that stand for their pixels, and whose noise is more than interpolation may err by."""
+    def too_noisy(self, region: Region) -> np.ndarray:
+        """Indices of the cells that stand for their pixels, and are noisier than interpolation may err."""
         stands = (region.weight.ravel()[self.index] > 0) & ~region.traced.ravel()[self.index] & ~self.glanced
         known = stands & (self.model > 0).all(1)
         relative = self.samples.change_variance[known] / self.model[known] ** 2
-        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > limits.tolerance]
+        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > self.tolerance]
 
-    def refined(
-        self, worlds: Worlds, cells: np.ndarray, samples: int, effort: Effort, progress: Callable[[float], None]
-    ) -> Pilot:
-        """With so many more samples of some cells."""
-        seed = effort.stream + REFINED
-        more = trace(difference_block, worlds, self.rays[cells], samples, effort.depth, seed, CELL, progress)
-        more = replace(more, gained=more.gained + self.thrown[cells])
-        return replace(self, samples=self.samples.placed(cells, more))
+
+def settled(canvas: Canvas, progress: Callable[[float], None]) -> Canvas:
+    """With the rest of the samples in those of the pilot's cells that stand for their pixels and are too noisy for it.
+
+    They come after the first picture. Which pixels are traced stays as it is.
+    """
+    pilot, effort, region = canvas.pilot, canvas.effort, canvas.region
+    rest = PILOT_SHARE * effort.samples - pilot_samples(effort)
+    if pilot is None or rest <= 0 or not effort.adaptive or not len(cells := pilot.too_noisy(region)):
+        return canvas
+    seed = effort.stream + REFINED
+    more = trace(difference_block, pilot.worlds, pilot.rays[cells], rest, effort.depth, seed, CELL, progress)
+    samples = pilot.samples.placed(cells, replace(more, gained=more.gained + pilot.thrown[cells]))
+    found = of_cells(samples, pilot.model, pilot.grid, pilot.glanced)
+    lost, gained, variance = in_pixels(found, canvas.shape, canvas.window)
+    return replace(canvas, region=replace(region, lost=lost, gained=gained, variance=variance))
 
 
 def pilot_samples(effort: Effort) -> int:
-    """Samples of a cell where a glance is not enough."""
-    return min(max(64, PILOT_SHARE * effort.samples), MOST_PILOT)
+    """Samples of a cell where a glance is not enough, at first."""
+    return min(max(LEAST_PILOT, FIRST_PILOT * effort.samples), MOST_PILOT)
 
 
 def looked(
@@ -279,7 +288,8 @@ def looked(
         cell_light[inside.ravel()] = received(
             worlds, cells[inside.ravel()], inside.shape, pilot_samples(effort), effort, CELL
         )
-    return Pilot(cells, samples, samples.albedo * cell_light / np.pi, bounces, ~wanted, grid, index)
+    model = samples.albedo * cell_light / np.pi
+    return Pilot(worlds, cells, samples, model, bounces, ~wanted, grid, index, limits.tolerance)
 
 
 def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> np.ndarray:
@@ -290,7 +300,8 @@ def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Eff
         row, column = np.divmod(pixel, width)
         return np.asarray(row // CELL * grid[1] + column // CELL)
 
-    total = thrown(worlds, film, PILOT_PHOTONS, effort.stream + 1, cell, grid[0] * grid[1])[0]
+    samples = PILOT_PHOTONS * pilot_samples(effort)
+    total = thrown(worlds, film, samples, effort.stream + 1, cell, grid[0] * grid[1])[0]
     rows, columns = (
         np.minimum(CELL, size - CELL * np.arange(n)) for size, n in zip((height, width), grid, strict=True)
     )
@@ -334,8 +345,16 @@ class Shot:
 def sampled(
     canvas: Canvas, start: Halves | None = None, progress: Callable[[float], None] = lambda share: None
 ) -> Iterator[Shot]:
-    """Passes over the traced pixels; see `pipeline.transport.passes.refine`."""
-    effort = canvas.effort
+    """Passes over the traced pixels, from where an earlier run stopped; see `pipeline.transport.passes.refine`.
+
+    After the first the pilot is `settled`.
+    """
+    effort, told = canvas.effort, 0.0
+
+    def forward(share: float) -> None:
+        nonlocal told
+        told = share
+        progress(told)
 
     def noisy(halves: Halves, ahead: int) -> np.ndarray:
         return still_noisy(canvas, halves, ahead) if effort.adaptive else halves.open
@@ -350,10 +369,18 @@ def sampled(
 
     rays, worlds, seed = canvas.rays[canvas.traced], canvas.worlds, effort.stream + 2
     strategy, traced_light = STRATEGIES[effort.strategy], light if canvas.film is not None else None
+    if start is not None and start.passes > 0:
+        canvas = settled(canvas, lambda share: progress(told))
+        yield Shot(canvas, start)
     for halves in refine(
-        strategy, worlds, rays, effort.samples, effort.depth, seed, noisy, traced_light, start, progress
+        strategy, worlds, rays, effort.samples, effort.depth, seed, noisy, traced_light, start, forward
     ):
-        yield Shot(canvas, halves)
+        if halves.passes == 1 and halves.open.any():
+            yield Shot(canvas, halves)
+        if halves.passes == 1:
+            canvas = settled(canvas, lambda share: progress(told))
+        if halves.passes > 1 or not halves.open.any():
+            yield Shot(canvas, halves)
 
 
 def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
@@ -392,21 +419,19 @@ def planes_of(
 ) -> dict[str, np.ndarray]:
     """The named fields as pictures of a window in the canvas's, and LS_noobj; the smooth part of the change is in."""
     images = {name: scattered(canvas, getattr(samples, name))[window] for name in names}
-    region = canvas.part[window]
-    gap = region.interpolated
-    images["albedo"][gap] = canvas.smooth_albedo[window][gap]
+    region, smooth = canvas.part[window], canvas.smooth_albedo[window]  # zero where pixels are traced
     light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)[canvas.window][window]
-    images["without"] = model = images["albedo"] * np.asarray(light / np.pi, np.float32)  # equation 7
-    fill = {
-        "lost": (region.lost, model),
-        "gained": (region.gained, model),
-        "change_variance": (region.variance, model**2),
-    }
-    for name, (relative, scale) in fill.items():
+    light = np.asarray(light / np.pi, np.float32)
+    images["albedo"] += smooth
+    images["without"] = images["albedo"] * light  # equation 7
+    model = smooth * light
+    for name, relative in (("lost", region.lost), ("gained", region.gained)):
         if name in images:
-            images[name][gap] = relative[gap] * scale[gap]
+            images[name] += relative * model
+    if "change_variance" in images:
+        images["change_variance"] += region.variance * model**2
     if "ground" in images:
-        images["ground"][gap] = 1.0
+        images["ground"] += region.interpolated
     return images
 
 

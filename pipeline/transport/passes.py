@@ -143,7 +143,7 @@ def refine(
         for half, part in enumerate((halves.first, halves.second)):
             tell = _part(forward, spent, len(index) * step, ahead, half)
             more = trace(strategy, worlds, rays[index], step, depth, seed + 2 * number + half, progress=tell)
-            parts.append(part.placed(index, more))
+            parts.append(part.placed(index, more) if number else more)
             if thrown is not None and number < plain:
                 share = step / sum(steps[: number + 1])
                 light[half] += share * (thrown(step, seed + 2 * number + half) - light[half])

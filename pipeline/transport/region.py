@@ -164,13 +164,7 @@ def plan(
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
-    lost, gained = (_relative(values, pilot, model, grid) for values in (pilot.lost, pilot.gained))
-    variance = _relative(pilot.change_variance, pilot, model**2, grid)
-    if glanced is not None and glanced.any():
-        far = glanced.reshape(*grid, 1)
-        lost, gained = (np.where(far, over_blocks(block_means(values), grid), values) for values in (lost, gained))
-        variance = np.where(far, over_blocks(block_means(variance), grid) / BLOCK**2, variance)
-    lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
+    lost, gained, variance = of_cells(pilot, model, grid, glanced)
     smoothed = gaussian_filter(lost + gained, (BLUR, BLUR, 0), mode="nearest")
     shown = pilot.alpha.reshape(grid) > 0
     changed = (np.abs(smoothed).max(-1) > limits.threshold) | shown
@@ -189,14 +183,38 @@ def plan(
     # Only around what changes is there anything to compute: zeros cost nothing until they are read.
     window = _around(changed, shape)
     mask = enlarge(changed, shape, window)
-    fields = [np.zeros((*shape, 3), np.float32) for _ in range(3)]
-    for field, values in zip(fields, (lost, gained, variance), strict=True):
-        field[window] = interpolate(values, shape, window)
     weight, everywhere = np.zeros(shape, np.float32), np.zeros(shape, bool)
     ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1) if not mask.all() else np.ones(mask.shape)
     weight[window] = ramp * ramp * (3 - 2 * ramp)
     everywhere[window] = enlarge(traced, shape, window) & (weight[window] > 0)
-    return Region(weight, everywhere, *fields), left
+    return Region(weight, everywhere, *in_pixels((lost, gained, variance), shape, window)), left
+
+
+def of_cells(
+    pilot: Samples, model: np.ndarray, grid: tuple[int, int], glanced: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lost and gained light, and the variance of their sum, each (R, C, 3), relative to LS_noobj; arguments of `plan`.
+
+    Light is smoothed, the variance is that before smoothing.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    lost, gained = (_relative(values, pilot, model, grid) for values in (pilot.lost, pilot.gained))
+    variance = _relative(pilot.change_variance, pilot, model**2, grid)
+    if glanced is not None and glanced.any():
+        far = glanced.reshape(*grid, 1)
+        lost, gained = (np.where(far, over_blocks(block_means(values), grid), values) for values in (lost, gained))
+        variance = np.where(far, over_blocks(block_means(variance), grid) / BLOCK**2, variance)
+    lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
+    return lost, gained, variance
+
+
+def in_pixels(cells: tuple[np.ndarray, ...], shape: tuple[int, int], window: Window) -> list[np.ndarray]:
+    """Cells (R, C, K), each interpolated to a picture (H, W, K) float32, within a window; zero around it."""
+    pictures = [np.zeros((*shape, values.shape[2]), np.float32) for values in cells]
+    for picture, values in zip(pictures, cells, strict=True):
+        picture[window] = interpolate(values, shape, window)
+    return pictures
 
 
 def _around(cells: np.ndarray, shape: tuple[int, int]) -> Window:
