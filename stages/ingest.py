@@ -29,7 +29,15 @@ from pipeline.image.raw import file_sha256, read_metadata
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_latlong, read_mask
-from pipeline.run.manifest import CaptureFacts, SceneWishes, load_capture, load_toml, problems_of, resolve_files
+from pipeline.run.manifest import (
+    CaptureFacts,
+    SceneWishes,
+    line_of,
+    load_capture,
+    load_toml,
+    problems_of,
+    resolve_files,
+)
 from pipeline.run.stage import Stage
 from pipeline.transport.meshes import load_meshes, refuse_undecodable
 from pipeline.transport.proxies import box, join
@@ -60,6 +68,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     dumped["probe"] |= _probe_file(facts, root, manifest, problems, flaws)
     proxies = _proxies(facts, root, manifest, problems, warnings)
     occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
+    _check_references(facts, manifest, brackets, problems)
     if problems:
         raise ManifestError(*problems, *flaws)
     if flaws:
@@ -169,6 +178,23 @@ def _occluders(
         else:
             occluders.append(Occluder(name=table.name, mask_file=str(path), mask_sha256=file_sha256(path)))
     return occluders
+
+
+def _check_references(facts: CaptureFacts, manifest: Path, brackets: dict[str, Bracket], problems: list[str]) -> None:
+    """Every reference lies within the photographs that show it."""
+    text = manifest.read_text().splitlines()
+    for number, table in enumerate(facts.reference):
+        for place, seen in enumerate(table.seen):
+            frame = next(iter(brackets[seen.view].frames), None) if seen.view in brackets else None
+            xs, ys = zip(*seen.corners_px)
+            inside = frame and min(xs) >= 0 and min(ys) >= 0 and max(xs) <= frame.width and max(ys) <= frame.height
+            if frame and not inside:
+                line = line_of(text, ["reference", str(number), "seen", str(place), "corners_px"])
+                problems.append(
+                    f"{manifest}:{line}: reference[{number}].seen[{place}].corners_px: reach x {min(xs):g} to "
+                    f"{max(xs):g}, y {min(ys):g} to {max(ys):g}; expected within {seen.view}'s {frame.width} x "
+                    f"{frame.height}"
+                )
 
 
 def _found(name: str, folders: list[Path], where: str, suffixes: tuple[str, ...], problems: list[str]) -> Path | None:

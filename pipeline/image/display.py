@@ -99,6 +99,8 @@ def cdl_collection(slopes: dict[str, np.ndarray], descriptions: dict[str, str], 
     """
     import PyOpenColorIO as ocio
 
+    if not slopes:  # which the library refuses to write
+        return '<ColorCorrectionCollection xmlns="urn:ASC:CDL:v1.01"/>\n'
     chain = ocio.GroupTransform()
     for name, slope in slopes.items():
         cdl = ocio.CDLTransform(slope=[float(v) for v in slope], id=name, description=descriptions[name])
