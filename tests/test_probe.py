@@ -15,9 +15,10 @@ from pipeline.probes import reflection, sphere_fit
 from pipeline.probes.combine import merge
 from pipeline.probes.filling import fill
 from pipeline.probes.levelling import relative_exposure
+from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import ViewMap
 from pipeline.probes.photographer import toward_photographer
-from pipeline.probes.unwrap import samples_per_axis, unwrap
+from pipeline.probes.unwrap import method_for, unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
 from stages import knobs, probe
@@ -104,12 +105,13 @@ def test_radians_per_pixel_is_the_derivative():
 # ---- unwrap with the true centre -----------------------------------------------------------------------------------
 
 
-def unwrapped(place: Place, camera: Camera, pose: np.ndarray, height: int = 64, split: int = 4, count: int = 3):
+def unwrapped(place: Place, camera: Camera, pose: np.ndarray, height: int = 64, split: int = 4):
     picture = photograph(place, camera, pose, split)
     centre = transform_points(invert_rigid(pose), np.array(place.ball))
-    size = sphere_fit.radius_in_pixels(camera, centre, RADIUS)
-    count = samples_per_axis(2 * height, size, count)
-    return unwrap(picture, camera, pose, centre, RADIUS, height, 2 * height, count, 0.97)
+    mirror = Mirror(camera, invert_rigid(pose)[:3, :3], centre, RADIUS, 0.97)
+    method = method_for(sphere_fit.radius_in_pixels(camera, centre, RADIUS), 2 * height)
+    channels = [np.float32(picture[..., i]) for i in range(3)]
+    return unwrap(np.ones(picture.shape[:2], np.float32), channels, mirror, height, 2 * height, method)
 
 
 @pytest.mark.parametrize("name", ["+x", "-x", "+y", "-y", "+z", "-z"])
@@ -344,7 +346,10 @@ def test_ball_thirty_degrees_off_axis():
     found = unwrapped(place, camera, pose, 32, 2)
     truth = 0.8 * truth_map(place, 32, 64)
     smooth = (found.coverage > 0.999) & (truth.max(-1) < 2)
-    inner = smooth & (found.sine < 0.9)
+    mirror = Mirror(
+        camera, invert_rigid(pose)[:3, :3], transform_points(invert_rigid(pose), np.array(place.ball)), RADIUS, 0.97
+    )
+    inner = smooth & (texel_directions(mirror, 32, 64, np.zeros((3, 3)), np.zeros((3, 3)))[0] < 0.9)
     assert np.median(np.abs(found.values[inner] / truth[inner] - 1)) < 0.005
 
 

@@ -17,10 +17,17 @@ def planes(picture: np.ndarray) -> list[np.ndarray]:
 def bilinear(groups: list[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Values (N, M, C) float32 of a picture split by `planes` at pixels ``x, y`` (N, M), first centre (0.5, 0.5).
 
-    OpenCV rounds positions to 1/32 px; beyond the outermost centres the border is repeated.
+    Positions are those of float32; beyond the outermost centres the border is repeated.
     """
     import cv2
 
     map_x, map_y = ((np.asarray(p) - HALF_PIXEL).astype(np.float32) for p in (x, y))
     found = [cv2.remap(group, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for group in groups]
     return np.concatenate([f.reshape(*x.shape, -1) for f in found], -1)
+
+
+def summed_areas(picture: np.ndarray, out: np.ndarray) -> None:
+    """Into ``out`` (H + 1, W + 1, C) float64: sums of a float32 picture (H, W, C) above and left of each corner."""
+    import cv2
+
+    cv2.integral(picture, sum=out, sdepth=cv2.CV_64F)

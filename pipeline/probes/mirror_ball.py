@@ -12,18 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import latlong_solid_angles
+from pipeline.conventions import CLIPPED, invert_rigid, latlong_solid_angles
 from pipeline.probes import combine, photographer, sphere_fit
 from pipeline.probes.ball_evidence import examine, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
-from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap, lookup_channels
+from pipeline.probes.mirror_geometry import Mirror, texel_directions
+from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.parallax import set_down
-from pipeline.probes.reflection import blind_half_angle, radians_per_pixel
-from pipeline.probes.unwrap import samples_per_axis, unwrap
+from pipeline.probes.reflection import blind_half_angle, deviation, radians_per_pixel
+from pipeline.probes.unwrap import displaced_variance, method_for, unwrap
 from pipeline.types import BallFit, Camera, Raster, View
 
 PIXEL_SIGMA = 0.5  # px: half-width of pixel and lookup, for the angular resolution of a texel
+MIN_RIM, EDGE_PX = 0.8, 2.0
+SURFACE_RIM = 0.97  # for measuring the reflectance
 
 
 class MirrorBall:
@@ -42,7 +45,7 @@ class MirrorBall:
             near = [ball.centre_world for ball in found.values()]
             found[name] = find_ball(name, photographs[name], plate, shots.camera_of(name), views[name], radius, near)
             warnings += complaints(name, found[name], radius)
-        known = examine(shots, found, radius, grid.rim)
+        known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM))
         warnings += known.warnings
         maps = {
             name: view_map(
@@ -74,30 +77,70 @@ class MirrorBall:
 def view_map(
     photograph: Raster, camera: Camera, view: View, ball: Found, radius: float, surface: Surface, grid: Grid
 ) -> ViewMap:  # fmt: skip
-    """One view on the lat-long grid, with its weights."""
+    """One view on the lat-long grid, with its weights. The variance leaves out what the reflectance adds to all texels.
+
+    A texel's direction is uncertain by the fit and the pose, and blurred by a pixel; photons are each pixel's own.
+    """
     height, width = grid.height, grid.width
-    fit, ratio = ball.fit, radius / float(np.linalg.norm(ball.fit.centre))
+    fit = ball.fit
     window, part = crop(camera, fit, radius)
-    picture = lookup_channels(photograph, window)
-    count = samples_per_axis(width, fit.radius_px, grid.supersample)
-    unwrapped = unwrap(picture, part, view.world_from_camera, fit.centre, radius, height, width, count, grid.rim)
-    valid = unwrapped.values[..., 6]
-    coverage = unwrapped.coverage * valid
-    safe = np.where(valid > 0, valid, 1)[..., None]
-    reflectance = surface.at(unwrapped.sine)
-    rgb = unwrapped.values[..., :3] / safe / reflectance
-    photon = unwrapped.values[..., 3:6] / safe / reflectance**2
-    sine = np.minimum(unwrapped.sine, 0.999)
-    sigma, per_pixel = angular_sigma(sine, fit, ratio, view)
-    pixels = latlong_solid_angles(height, width) / np.where(np.isfinite(per_pixel), per_pixel, np.inf)
-    gradient = combine.gradient_per_radian(rgb)
-    displaced = (gradient * np.where(np.isfinite(sigma), sigma, 0)[..., None]) ** 2
-    variance = photon / np.maximum(pixels, 1)[..., None] + displaced
-    blur = PIXEL_SIGMA * np.sqrt(per_pixel)
-    trust = combine.rim_fade(sine, sigma, grid.rim) * coverage
-    share = unwrapped.values[..., 7] / safe[..., 0] * (coverage > 0)
-    quality = Quality(np.hypot(sigma, blur), pixels, photon.mean(-1))
-    return ViewMap(rgb, variance, trust / (1 + 100 * share), coverage, share, quality)
+    rotation = invert_rigid(view.world_from_camera)[:3, :3]
+    rim = min(grid.rim, usable_rim(fit, radius))
+    mirror = Mirror(part, rotation, fit.centre, radius, rim)
+    valid, channels = lookup_planes(photograph, window)
+    shown = unwrap(valid, channels, mirror, height, width, method_for(fit.radius_px, width))
+    sine, direction = texel_directions(mirror, height, width, fit.covariance, view.covariance[:3, :3])
+    reflectance = surface.at(sine).astype(np.float32)
+    rgb = shown.values[..., :3] / reflectance
+    photon = shown.values[..., 3:6] / reflectance**2
+    variance = photon * shown.spread[..., None] + displaced_variance(rgb, direction, shown.coverage)
+    pixels = np.where(np.isfinite(sine), shown.pixels, 0)
+    blur = PIXEL_SIGMA**2 * latlong_solid_angles(height, width) / np.maximum(pixels, 1e-6)
+    sigma = np.sqrt(np.where(np.isfinite(sine), direction[..., 0] + direction[..., 1] + blur, np.nan))
+    clipped = shown.values[..., 6]
+    trust = combine.rim_fade(sine, sigma, rim) * shown.coverage
+    quality = Quality(sigma, pixels, photon.mean(-1))
+    return ViewMap(rgb, variance, trust / (1 + 100 * clipped), shown.coverage, clipped, quality)
+
+
+def usable_rim(fit: sphere_fit.SphereFit, radius: float) -> float:
+    """Outermost radius that is worth using, as a fraction of the silhouette's; at least MIN_RIM.
+
+    Towards the silhouette a pixel spans ever more of the world: `radians_per_pixel` grows without bound. A ring is kept
+    while three standard uncertainties of its direction (fit and pixel) are less than the half angle of the cone that
+    would stay unseen without it, which the gain is. The last EDGE_PX pixels, and three standard uncertainties of the
+    outline, mix with what is behind the ball.
+    """
+    distance = float(np.linalg.norm(fit.centre))
+    axis, ratio = fit.centre / distance, radius / distance
+    per_metre = fit.radius_px / radius
+    along = float(axis @ fit.covariance @ axis)
+    aside = 0.5 * max(float(np.trace(fit.covariance)) - along, 0.0)
+    edge = per_metre * float(np.sqrt(aside + ratio**2 * along))
+    rim = np.linspace(MIN_RIM, 1, 2000, endpoint=False)
+    sigma = radians_per_pixel(rim, ratio, fit.radius_px)[0] * np.hypot(edge, PIXEL_SIGMA)
+    unseen = np.pi - deviation(rim, ratio)
+    margin = EDGE_PX + max(fit.inset_px, 0.0) + 3 * edge
+    good = (3 * sigma < unseen) & (rim < 1 - margin / fit.radius_px)
+    return float(rim[good].max(initial=MIN_RIM))
+
+
+def lookup_planes(photograph: Raster, window: tuple[slice, slice]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Where a part of a photograph is known (h, w), and (h, w) each of RGB, variance RGB and clipped; zero elsewhere.
+
+    A clipped pixel's infinite variance becomes the square of its value: 100 %.
+    """
+    colours = [np.asarray(photograph[c][window], np.float32) for c in "RGB"]
+    variances = [np.asarray(photograph[f"variance.{c}"][window], np.float32) for c in "RGB"]
+    valid = np.isfinite(colours[0] + colours[1] + colours[2])
+    if not valid.all():
+        colours = [np.where(valid, c, 0) for c in colours]
+    for i, (c, v) in enumerate(zip(colours, variances, strict=True)):
+        known = np.isfinite(v) & valid
+        if not known.all():
+            variances[i] = np.where(known, v, c * c)
+    clipped = (photograph["mask"][window] & CLIPPED > 0) & valid
+    return valid.astype(np.float32), [*colours, *variances, clipped.astype(np.float32)]
 
 
 def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tuple[slice, slice], Camera]:
@@ -113,24 +156,6 @@ def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tupl
         "height": int(size[1]),
     }
     return (slice(low[1], high[1]), slice(low[0], high[0])), camera.model_copy(update=moved)
-
-
-def angular_sigma(
-    sine: np.ndarray, fit: sphere_fit.SphereFit, ratio: float, view: View
-) -> tuple[np.ndarray, np.ndarray]:
-    """Standard uncertainty [rad] of each texel's direction, and the solid angle of one pixel there; NaN where blind.
-
-    The centre's covariance is split into a shift across the ray and a change of size; the pose's rotation is added.
-    """
-    radial, across = radians_per_pixel(sine, ratio, fit.radius_px)
-    axis = fit.centre / np.linalg.norm(fit.centre)
-    pixels_per_metre = fit.radius_px * ratio / np.sin(np.arcsin(ratio)) / (ratio * np.linalg.norm(fit.centre))
-    along = float(axis @ fit.covariance @ axis)
-    sideways = max(float(np.trace(fit.covariance)) - along, 0.0) / 2
-    shift = sideways * pixels_per_metre**2
-    growth = along * (fit.radius_px / np.linalg.norm(fit.centre)) ** 2
-    turn = float(np.trace(view.covariance[:3, :3])) / 3
-    return np.sqrt(radial**2 * (shift + sine**2 * growth) + across**2 * shift + 2 * turn), radial * across
 
 
 def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:

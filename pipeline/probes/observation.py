@@ -34,12 +34,12 @@ class Shots:
 class Grid:
     """The map that is asked for: ``width`` texels around, half as many down.
 
-    ``supersample``: least lookups per texel and axis; ``rim``: outermost radius of a ball that is used, as a fraction.
+    ``supersample``: least lookups per texel and axis; ``rim``: outermost radius of a ball that may be used, as a fraction.
     """
 
     width: int
     supersample: int = 3
-    rim: float = 0.97
+    rim: float = 0.999
 
     @property
     def height(self) -> int:

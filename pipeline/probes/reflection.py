@@ -66,6 +66,16 @@ def directions_from_rays(rays: np.ndarray, centre: np.ndarray, radius: float) ->
     return rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
 
 
+def solid_angle_gain(sine2: np.ndarray, ratio: float) -> np.ndarray:
+    """Solid angle of environment per solid angle of picture, at squared sines of the incidence ``sine2``.
+
+    ``sin theta dtheta / (sin rho drho)`` in closed form; (2 / k - 1)^2 in the middle, infinite at the silhouette.
+    """
+    k = np.asarray(ratio, np.asarray(sine2).dtype)
+    into, along = np.sqrt(1 - sine2), np.sqrt(1 - k * k * sine2)  # cosines of incidence and of rho
+    return (2 * into * along / k - (1 - 2 * sine2)) * (2 * along / (k * into) - 1)
+
+
 def radians_per_pixel(sine: np.ndarray, ratio: float, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
     """How many radians of environment one pixel spans along the radius and across it, at radius fraction ``sine``."""
     sine = np.asarray(sine)

@@ -1,0 +1,110 @@
+"""Integrals of a ball's picture over lat-long texels: an area splat that is exact, however small the pixels are.
+
+Each pixel spreads its radiance over the solid angle it mirrors, and each texel collects what falls into it. The outline
+of a texel, as the ball shows it, is a polygon in the picture. Its edges are replaced by stairs that keep its area, and
+the sum of the pixels' ``L dw`` inside stairs is read off a summed-area table (Crow, Summed-area tables for texture
+mapping, 1984), without any error but rounding. Two neighbours walk along the same stairs in opposite directions, so
+what one loses the other gains: the sum over texels is the sum over pixels, for lamps of any size, on the seam and at
+the poles, and positive light stays positive.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.light.sampling import summed_areas
+from pipeline.probes.mirror_geometry import BAND_PIXELS, BAND_TEXELS, WORKERS, Mirror, bands, pixel_solid_angles
+
+STEP_PX = 1.5  # longest tread or riser; what lies in it may count for the neighbour
+STEPS = (1, 2, 4, 8, 16, 32)  # stairs per edge, by its length
+
+
+def area_sums(
+    channels: list[np.ndarray], mirror: Mirror, corners: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Sums over texels (H, W, C), float32, of channel times solid angle [sr].
+
+    ``channels``: (h, w) each, float32, finite. ``corners``: x, y and incidence (H + 1, W + 1) of the texels' corners,
+    from `mirror_geometry.corners`. Texels whose corners are all blind are zero. The result does not depend on the
+    number of threads.
+    """
+    height, width = corners[0].shape[0] - 1, corners[0].shape[1] - 1
+    sums = np.zeros((height, width, len(channels)), np.float32)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        rows = list(bands(mirror.camera.height, BAND_PIXELS // mirror.camera.width))
+        density = np.concatenate(list(pool.map(lambda block: pixel_solid_angles(mirror, block), rows)))
+        product = np.zeros((*density.shape, 4), np.float32)
+        table = np.empty((density.shape[0] + 1, density.shape[1] + 1, 4))
+        for first in range(0, len(channels), 4):
+            group = channels[first : first + 4]
+            list(pool.map(lambda block, group=group: _fill(product[block], group, density, block), rows))
+            summed_areas(product, table)
+            work = [
+                pool.submit(
+                    _band, table, [c[block.start : block.stop + 1] for c in corners], sums[block, :, first : first + 4]
+                )
+                for block in bands(height, BAND_TEXELS // width)
+            ]
+            for job in work:
+                job.result()
+    return sums
+
+
+def _fill(product: np.ndarray, group: list[np.ndarray], density: np.ndarray, block: slice) -> None:
+    for i, channel in enumerate(group):
+        np.multiply(channel[block], density[block], out=product[..., i])
+
+
+def _band(table: np.ndarray, corners: list[np.ndarray], out: np.ndarray) -> None:
+    """Sums of the texels between some lines of corners (n + 1, W + 1), into ``out`` (n, W, C)."""
+    x, y, angle = corners
+    outside = angle > np.pi / 2
+    dark = outside[1:, 1:] & outside[:-1, 1:] & outside[1:, :-1] & outside[:-1, :-1]
+    if dark.all():
+        return
+    level = _edge_sums(table, x[:, :-1], y[:, :-1], x[:, 1:], y[:, 1:])
+    upright = _edge_sums(table, x[:-1], y[:-1], x[1:], y[1:])
+    found = level[1:] - level[:-1] + upright[:, :-1] - upright[:, 1:]
+    out[...] = np.where(dark[..., None], 0, found[..., : out.shape[2]])
+
+
+def _edge_sums(table: np.ndarray, x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray) -> np.ndarray:
+    """What lies left of straight edges (N, M, 4); minus that where they run upwards."""
+    total = _stairs(table, x0, y0, x1, y1, 1)
+    slanted = np.minimum(np.abs(x1 - x0), np.abs(y1 - y0)) / STEP_PX  # along rows and columns one stair is exact
+    for fewer, steps in pairwise(STEPS):
+        now = (slanted > fewer) & ((slanted <= steps) | (steps == STEPS[-1]))
+        if now.any():
+            total[now] = _stairs(table, x0[now], y0[now], x1[now], y1[now], steps)
+    return total
+
+
+def _stairs(
+    table: np.ndarray, x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray, steps: int
+) -> np.ndarray:
+    """What lies left of edges (..., 4) that go straight up in the middle of each of ``steps`` parts."""
+    total = np.zeros((*x0.shape, 4))
+    for k in range(steps):
+        x = x0 + (k + 0.5) / steps * (x1 - x0)
+        total += _interpolated(table, x, y0 + (k + 1) / steps * (y1 - y0))
+        total -= _interpolated(table, x, y0 + k / steps * (y1 - y0))
+    return total
+
+
+def _interpolated(table: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The table (N, 4) at pixels, bilinear in float64: OpenCV rounds positions in doubles to 1/32 px."""
+    rows, columns = table.shape[:2]
+    x, y = np.clip(x, 0, columns - 1 - 1e-9), np.clip(y, 0, rows - 1 - 1e-9)
+    column, row = x.astype(np.intp), y.astype(np.intp)
+    right, down = (x - column)[..., None], (y - row)[..., None]
+    flat, index = table.reshape(-1, 4), row * columns + column
+    above, below = flat.take(index, 0), flat.take(index + columns, 0)
+    above += right * (flat.take(index + 1, 0) - above)
+    below += right * (flat.take(index + columns + 1, 0) - below)
+    below -= above
+    below *= down
+    above += below
+    return above
