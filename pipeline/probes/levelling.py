@@ -65,13 +65,25 @@ def level(views: list[ViewMap]) -> Levels:
         design = np.array([[float(k == j) - float(k == i) for k in free] for i, j in used])
         sigma = np.array([pairs[p].sigma for p in used])
         measured = np.array([pairs[p].log for p in used])
-        inverse = np.linalg.inv((design.T / sigma**2) @ design)
-        log[free] = inverse @ (design.T / sigma**2) @ measured
+        precision_of = np.linalg.inv(_shared_errors(used, sigma, len(views)))
+        inverse = np.linalg.inv(design.T @ precision_of @ design)
+        log[free] = inverse @ design.T @ precision_of @ measured
         loops = len(used) - len(free)
         if loops:
-            chi2 = float((((measured - design @ log[free]) / sigma) ** 2).sum() / loops)
+            left = measured - design @ log[free]
+            chi2 = float(left @ precision_of @ left / loops)
         covariance[np.ix_(free, free)] = inverse * (max(1.0, chi2) if loops else 1.0)
     return Levels(log, covariance, pairs, chi2)
+
+
+def _shared_errors(pairs: list[tuple[int, int]], sigma: np.ndarray, count: int) -> np.ndarray:
+    """Covariance (P, P) of measured log ratios: two thirds of a variance are its two views', and return in their other
+    ratios; one third is the pair's own (its cells). Taken as independent, redundant pairs would promise too much.
+    """
+    signs = np.zeros((len(pairs), count))
+    for row, (i, j) in enumerate(pairs):
+        signs[row, [i, j]] = -1, 1
+    return np.outer(sigma, sigma) * (signs @ signs.T / 3 + np.eye(len(pairs)) / 3)
 
 
 def _reachable(count: int, pairs: dict[tuple[int, int], Pair]) -> set[int]:
