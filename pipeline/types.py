@@ -90,7 +90,7 @@ class Bracket(Record):
     """The frames of one view, sorted from the shortest to the longest exposure."""
 
     name: str
-    role: str  # "plate" or "ball"
+    role: str  # "plate", "ball" or "fisheye"
     frames: list[Frame]
 
 
@@ -202,6 +202,9 @@ class Emitter(Record):
     half_angle_rad: float  # of the uniform disc of the same spread
     irradiance: Array  # (3,), ACEScg, of its texels alone on a surface that faces ``direction``
     texels: Indices  # (N,), flat indices (row * width + column) into the environment, ascending
+    irradiance_sigma: Array = np.zeros(3)  # (3,) of ``irradiance``
+    lower_bound: bool = False  # clipped in every frame, and nothing tells how bright it really is
+    evidence: str = "measured"  # or "recovered", or "clipped": where its brightness comes from
 
 
 class Balance(Record):

@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from pipeline.image.exposure import exposure_of
 from pipeline.image.raw import file_sha256, read_metadata
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
-from pipeline.run.formats import read_latlong, read_mask
+from pipeline.run.formats import read_latlong, read_linear, read_mask
 from pipeline.run.manifest import (
     CaptureFacts,
     SceneWishes,
@@ -38,6 +39,7 @@ from pipeline.run.manifest import (
     problems_of,
     resolve_files,
 )
+from pipeline.run.probe_facts import FisheyePairFacts, LatLongFacts
 from pipeline.run.stage import Stage
 from pipeline.transport.meshes import load_meshes, refuse_undecodable
 from pipeline.transport.proxies import box, join
@@ -65,7 +67,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     board = _board_photos(facts, root, manifest, problems)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
-    dumped["probe"] |= _probe_file(facts, root, manifest, problems, flaws)
+    dumped["probe"] |= _probe_files(facts, root, manifest, problems, flaws)
     proxies = _proxies(facts, root, manifest, problems, warnings)
     occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
     _check_references(facts, manifest, brackets, problems)
@@ -121,21 +123,30 @@ def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: lis
     return photos
 
 
-def _probe_file(
+def _probe_files(
     facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]
-) -> dict[str, str]:
-    """Path and digest of the map that some kinds of probe are, once it could be read; empty for the others."""
-    name = getattr(facts.probe, "file", None)
-    if name is None:
-        return {}
-    path = _found(name, [manifest.parent, root], f"{manifest}: probe.file", MAP_SUFFIXES, problems)
-    if path is None:
-        return {}
-    try:
-        read_latlong(path)
-    except ArtifactError as error:
-        flaws.append(str(error))
-    return {"path": str(path), "sha256": file_sha256(path)}
+) -> dict[str, Any]:
+    """Paths and digests of the pictures that some kinds of probe are, once they could be read; empty for the others."""
+
+    def found(name: str, where: str, read: Callable[[Path], Any]) -> dict[str, str]:
+        path = _found(name, [manifest.parent, root], f"{manifest}: {where}", MAP_SUFFIXES, problems)
+        if path is None:
+            return {}
+        try:
+            read(path)
+        except ArtifactError as error:
+            flaws.append(str(error))
+        return {"path": str(path), "sha256": file_sha256(path)}
+
+    if isinstance(facts.probe, LatLongFacts):
+        return found(facts.probe.file, "probe.file", read_latlong)
+    if isinstance(facts.probe, FisheyePairFacts):
+        lenses = []
+        for number, lens in enumerate(facts.probe.fisheye):
+            where = f"probe.fisheye[{number}].file"
+            lenses.append(lens.model_dump(mode="json") | (found(lens.file, where, read_linear) if lens.file else {}))
+        return {"fisheye": lenses}
+    return {}
 
 
 def _proxies(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], warnings: list[str]) -> list[Proxy]:
@@ -250,12 +261,14 @@ def _brackets(
     facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str], warnings: list[str]
 ) -> dict[str, Bracket]:
     """Every view's frames, read in parallel (decoders and digests release the interpreter)."""
-    patterns = {"plate": facts.plate.files, **{ball.name: ball.files for ball in facts.ball}}
+    lenses = facts.probe.fisheye if isinstance(facts.probe, FisheyePairFacts) else []
+    tables = {"plate": ("plate", facts.plate.files)}
+    tables |= {ball.name: (f"ball[{i}]", ball.files) for i, ball in enumerate(facts.ball)}
+    tables |= {lens.name: (f"probe.fisheye[{i}]", lens.files) for i, lens in enumerate(lenses) if lens.files}
     stated = _stated_exposures(facts, root, manifest, problems)
     listing = {}
-    for number, (name, wanted) in enumerate(patterns.items()):
-        where = f"{manifest}: {'plate' if name == 'plate' else f'ball[{number - 1}]'}.files"
-        listing[name], found = resolve_files(wanted, root, where)
+    for name, (table, wanted) in tables.items():
+        listing[name], found = resolve_files(wanted, root, f"{manifest}: {table}.files")
         problems.extend(found)
 
     def read(path: Path) -> Frame | str:
@@ -271,9 +284,10 @@ def _brackets(
     brackets = {}
     for name, files in listing.items():
         frames = [_restated(frame, stated.get(f, {})) for f in files if isinstance(frame := read_files[f], Frame)]
-        role = "plate" if name == "plate" else "ball"
+        role = tables[name][0].split("[")[0].removeprefix("probe.")
         brackets[name] = Bracket(name=name, role=role, frames=_sorted_unique(name, frames, flaws, warnings))
-    _check_sizes(brackets, {ball.name for ball in facts.ball if ball.camera is not None}, flaws, warnings)
+    own = {ball.name for ball in facts.ball if ball.camera is not None} | {lens.name for lens in lenses}
+    _check_sizes(brackets, own, flaws, warnings)
     return brackets
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pipeline.probes.fisheye import FisheyePair
 from pipeline.probes.mirror_ball import MirrorBall
 from pipeline.probes.observation import Kind
 from pipeline.probes.panorama import Panorama
 from pipeline.probes.ready_made import ReadyMade
 
-KINDS: dict[str, Kind] = {"mirror_ball": MirrorBall(), "map": ReadyMade(), "panorama": Panorama()}
+KINDS: dict[str, Kind] = {
+    "mirror_ball": MirrorBall(), "map": ReadyMade(), "panorama": Panorama(), "fisheye_pair": FisheyePair(),
+}  # fmt: skip

@@ -17,8 +17,10 @@ from pipeline.camera.lens import pixel_rays
 from pipeline.camera.markers import grey, tone
 from pipeline.camera.opencv_bridge import feature_matches
 from pipeline.camera.rigid import nearest_rotation, rotation_exp
-from pipeline.conventions import direction_from_latlong, latlong_from_direction
+from pipeline.conventions import direction_from_latlong, latlong_from_direction, latlong_solid_angles
+from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
+from pipeline.probes.map_scale import COARSE, FEWEST_SR, seen_by_plate
 from pipeline.probes.observation import Shots
 
 CROP_DEG, CROP_YAWS, CROP_PITCHES = 66.0, 8, (-45.0, 0.0, 45.0)  # perspective windows onto the panorama
@@ -27,6 +29,7 @@ LOWE_RATIO = 0.8
 TRIALS, SEED = 4000, 0
 COARSE_RAD, FINE_RAD = np.radians(2.0), np.radians(0.1)  # of a match: at first, and at least
 FEWEST_MATCHES, SHARE = 8, 2e-3  # that must agree, and more of many: wrong ones agree to 2 degrees at 0.0006
+LEAST_ALIKE, STANDS_OUT = 0.6, 0.15  # correlation of the tones at the right yaw, and its lead over others
 FINEST_TEXELS = 0.1  # of the panorama: what interpolation and the feature's own place cost all matches alike
 HORIZON = np.radians(3.0)  # below it a ray of the plate may end on the plane
 FARTHEST = 20.0  # times the camera's height: beyond, the plane is no longer believed
@@ -99,6 +102,30 @@ def from_features(latlong: np.ndarray, shown: np.ndarray, shots: Shots, centre: 
     return Orientation(found.rotation, covariance, found.route, found.numbers)
 
 
+def from_overlap(
+    latlong: np.ndarray, shown: np.ndarray, other: np.ndarray, other_shown: np.ndarray, known: Orientation
+) -> Orientation | None:
+    """From features that two lat-long pictures share, both in their own frames, the other's rotation ``known``."""
+    focal = max(latlong.shape[1] / (2 * np.pi), SMALLEST_FOCAL)
+    here, there = visible_windows(latlong, shown, focal), visible_windows(other, other_shown, focal)
+    local, world = [np.empty((0, 3))], [np.empty((0, 3))]
+    for picture in there:
+        for window, (on_other, on_this) in zip(
+            here, feature_matches(picture.coded, [one.coded for one in here], LOWE_RATIO), strict=True
+        ):
+            whole = window.holds(on_this) & picture.holds(on_other)
+            local.append(window.directions(on_this[whole]))
+            world.append(picture.directions(on_other[whole]) @ known.rotation.T)
+    ours, theirs = np.concatenate(local), np.concatenate(world)
+    if len(ours) < FEWEST_MATCHES:
+        return None
+    spot = np.unique(np.round(theirs, 2), axis=0, return_inverse=True)[1].ravel()
+    found = robust(ours, theirs, np.full(theirs.shape, np.nan), spot)
+    if found is None:
+        return None
+    return Orientation(found.rotation, found.covariance + known.covariance, "overlap", found.numbers)
+
+
 def robust(local: np.ndarray, far: np.ndarray, near: np.ndarray, spot: np.ndarray) -> Orientation | None:
     """RANSAC and refinement over matches (N, 3); ``near`` is NaN where a spot cannot lie on the plane.
 
@@ -127,6 +154,50 @@ def robust(local: np.ndarray, far: np.ndarray, near: np.ndarray, spot: np.ndarra
     numbers = {"matches": len(local), "agree": int(used.sum()), "spots": spots, "rms_deg": float(np.degrees(sigma)),
                "on_plane": int((np.isfinite(near[used, 0]) & (world[used] == near[used]).all(-1)).sum())}  # fmt: skip
     return Orientation(rotation, covariance, "features", numbers)
+
+
+def from_tones(
+    rgb: np.ndarray, shown: np.ndarray, shots: Shots, centre: np.ndarray, upright: np.ndarray, up_sigma_rad: float
+) -> Orientation | None:
+    """Yaw at which the picture's tones resemble the plate's most, given how it is upright; None when none stands out.
+
+    Weighted correlation of log radiance on texels of 2.8 degrees, the plane seen from ``centre``; ``rgb`` (H, W, 3)
+    is already turned by ``upright`` (3, 3). The peak must exceed 0.6, and every other by 0.15. Covariance: half a texel
+    of yaw, and the stated uncertainty of up.
+    """
+    theirs, weight = seen_by_plate(shots, centre)
+    share = resize_environment(shown[..., None].astype(float), *COARSE)[..., 0]
+    ours = resize_environment(rgb * shown[..., None], *COARSE).mean(-1) / np.where(share > 0, share, 1)
+    known = share > 0.99
+    area = latlong_solid_angles(*COARSE) * weight * (theirs.mean(-1) > 0)
+    if area.sum() < FEWEST_SR:
+        return None
+    tones = [
+        np.log(np.maximum(picture, 1e-6 * max(float(picture.max()), 1e-30))) for picture in (ours, theirs.mean(-1))
+    ]
+    shifts = range(COARSE[1])
+    score = np.array([_alike(np.roll(tones[0], k, 1), tones[1], area * np.roll(known, k, 1)) for k in shifts])
+    best = int(score.argmax())
+    apart = np.abs((np.arange(COARSE[1]) - best + COARSE[1] // 2) % COARSE[1] - COARSE[1] // 2)
+    second = float(score[apart > 8].max())
+    if score[best] < LEAST_ALIKE or score[best] - second < STANDS_OUT:
+        return None
+    left, middle, right = (float(score[(best + k) % COARSE[1]]) for k in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    step = 2 * np.pi / COARSE[1]
+    # A roll by k columns raises u: the picture turns clockwise seen from above (u grows from -Z over +X).
+    yaw = -step * (best + (0.5 * (left - right) / bend if bend < 0 else 0.0))
+    covariance = np.diag([up_sigma_rad**2, (0.5 * step) ** 2, up_sigma_rad**2])
+    numbers = {"correlation": middle, "second": second}
+    return Orientation(rotation_exp(np.array([0, yaw, 0])) @ upright, covariance, "tones", numbers)
+
+
+def _alike(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> float:
+    """Weighted correlation (Pearson) of two pictures (H, W)."""
+    weight = weight / max(float(weight.sum()), 1e-12)
+    first, second = first - (weight * first).sum(), second - (weight * second).sum()
+    power = (weight * first**2).sum() * (weight * second**2).sum()
+    return float((weight * first * second).sum() / np.sqrt(power)) if power > 0 else 0.0
 
 
 def nearer(turned: np.ndarray, far: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -183,26 +254,49 @@ def matches(latlong: np.ndarray, shown: np.ndarray, shots: Shots) -> tuple[np.nd
     plate = np.nan_to_num(grey(shots.photographs["plate"].rgb()))
     height, width = (n // step * step for n in plate.shape)
     plate = plate[:height, :width].reshape(height // step, step, width // step, step).mean((1, 3))
-    rays = [(rotation, window_rays(focal) @ rotation.T) for rotation in windows()]
+    seen = visible_windows(latlong, shown, focal)
+    found = feature_matches(coded(plate), [window.coded for window in seen], LOWE_RATIO)
+    local, px = [np.empty((0, 3))], [np.empty((0, 2))]
+    for window, (on_plate, on_window) in zip(seen, found, strict=True):
+        whole = window.holds(on_window)
+        local.append(window.directions(on_window[whole]))
+        px.append(on_plate[whole] * step)
+    return np.concatenate(local), np.concatenate(px)
+
+
+@dataclass(frozen=True)
+class Window:
+    """A perspective window onto a lat-long picture: uint8 tones and which pixels are shown (N, N)."""
+
+    coded: np.ndarray
+    shown: np.ndarray
+    map_from_window: np.ndarray
+    focal: float
+
+    def holds(self, px: np.ndarray) -> np.ndarray:
+        """Which pixels (N, 2) lie where the picture is not empty."""
+        size = self.shown.shape[0]
+        return np.asarray(self.shown[tuple(np.clip(px.astype(int), 0, size - 1).T[::-1])])
+
+    def directions(self, px: np.ndarray) -> np.ndarray:
+        """Directions (N, 3), the picture's frame, of pixels (N, 2)."""
+        xy = (px - self.shown.shape[0] / 2) / self.focal
+        ray = np.concatenate([xy, np.ones((len(xy), 1))], 1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True) @ self.map_from_window.T)
+
+
+def visible_windows(latlong: np.ndarray, shown: np.ndarray, focal: float) -> list[Window]:
+    """The windows of which at least 30 % are shown."""
     picture = np.dstack([grey(latlong), shown]).astype(np.float32)
     around = planes(np.concatenate([picture[:, -1:], picture, picture[:, :1]], 1))
-    seen, crops = [], []
-    for rotation, w in rays:
-        u, v = latlong_from_direction(w)
+    found = []
+    for rotation in windows():
+        u, v = latlong_from_direction(window_rays(focal) @ rotation.T)
         crop = bilinear(around, u * latlong.shape[1] + 1, v * latlong.shape[0])
-        if (crop[..., 1] > 0.999).mean() > 0.3:
-            seen.append((rotation, crop[..., 1]))
-            crops.append(coded(crop[..., 0]))
-    found = feature_matches(coded(plate), crops, LOWE_RATIO)
-    local, px = [], []
-    for (rotation, inside), (on_plate, on_crop) in zip(seen, found, strict=True):
-        size = inside.shape[0]
-        whole = inside[tuple(np.clip(on_crop.astype(int), 0, size - 1).T[::-1])] > 0.999
-        xy = (on_crop[whole] - size / 2) / focal
-        ray = np.concatenate([xy, np.ones((len(xy), 1))], 1)
-        local.append(ray / np.linalg.norm(ray, axis=1, keepdims=True) @ rotation.T)
-        px.append(on_plate[whole] * step)
-    return np.concatenate([np.empty((0, 3)), *local]), np.concatenate([np.empty((0, 2)), *px])
+        whole = crop[..., 1] > 0.999
+        if whole.mean() > 0.3:
+            found.append(Window(coded(np.where(whole, crop[..., 0], 0)), whole, rotation, focal))
+    return found
 
 
 def coded(radiance: np.ndarray) -> np.ndarray:

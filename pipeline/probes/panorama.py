@@ -1,11 +1,13 @@
 """A stitched 360-degree panorama, taken near the objects: a ready-made map whose rotation is found from the plate.
 
 The rotation is, in this order, stated; from points that were clicked in panorama and plate; from features that both
-show; else it is asked for. The patch where tripod or hand stood is taken as not seen: the plate's plane is laid there.
+show; from the yaw at which its tones are the plate's; else it is asked for. The patch where tripod or hand stood is
+taken as not seen: the plate's plane is laid there.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from pipeline.probes.resample import turned
 from pipeline.run.errors import CaptureError
 from pipeline.run.formats import read_latlong
 
+ON_TONES = 128, 256  # texels on which tones are compared
 SOFT_DEG = 3.0  # over which the nadir patch fades out
 
 
@@ -36,8 +39,7 @@ class Panorama:
         seen = finished("panorama", light, turn, found.sigma_rad, shots, taken_here=True, seen=shown)
         told = {"route": found.route, "sigma_deg": float(np.degrees(found.sigma_rad)), **found.numbers}
         numbers = seen.numbers | {"orientation": told | {"world_from_map": found.rotation.tolist()}}
-        evidence = [*seen.evidence, *reasons(shots, found)]
-        return Observation(seen.maps, seen.centre_world, {}, numbers, seen.warnings, evidence)
+        return replace(seen, numbers=numbers, evidence=[*seen.evidence, *reasons(shots, found)])
 
 
 def oriented(light: LatLong, shots: Shots) -> orientation.Orientation:
@@ -54,10 +56,14 @@ def oriented(light: LatLong, shots: Shots) -> orientation.Orientation:
         return orientation.from_points(*pairs, up, level)
     found = orientation.from_features(light.rgb, light.valid, shots, centre)
     if found is None:
+        upright = rotation_of(0.0, up)
+        turn = turned(light.channels(), upright, *ON_TONES, 2)
+        found = orientation.from_tones(turn.values[..., :3], turn.values[..., 3] > 0.99, shots, centre, upright, level)
+    if found is None:
         raise CaptureError(
-            "panorama: too few features are shared with the plate to say how it is turned; needed "
-            f"{orientation.FEWEST_MATCHES}; click one lamp or corner in both ([[probe.point]] px, plate_px), or state "
-            "probe.yaw_deg"
+            "panorama: it shares too few features with the plate to say how it is turned, needed "
+            f"{orientation.FEWEST_MATCHES}, and no yaw makes it look like the plate; click one lamp or "
+            "corner in both ([[probe.point]] px, plate_px), or state probe.yaw_deg"
         )
     return found
 
@@ -75,6 +81,8 @@ def reasons(shots: Shots, found: orientation.Orientation) -> list[dict[str, Any]
     because = {
         "stated": "probe.yaw_deg states it",
         "points": f"{found.numbers.get('points')} clicked points and the panorama's up",
+        "tones": f"at this yaw its tones correlate with the plate's by {found.numbers.get('correlation', 0):.2f}, at "
+        f"others by {found.numbers.get('second', 0):.2f} at most",
         "features": f"{found.numbers.get('agree')} of {found.numbers.get('matches')} features agree with the plate to "
         f"{found.numbers.get('rms_deg', 0):.2f} degrees",
     }[found.route]

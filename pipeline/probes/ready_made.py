@@ -133,13 +133,14 @@ def finished(
     raw = turn.values[..., :3] / safe[..., None]
     found = map_scale.solve(shots, raw, coverage, centre, taken_here)
     rgb = raw * found.factor
-    variance = (float(probe["sigma_rel"]) ** 2 + found.sigma_rel**2) * rgb**2
+    variance = (float(probe["sigma_rel"]) * rgb) ** 2
     variance += (QUANTISATION * rgb.max(-1, keepdims=True)) ** 2
     variance += (combine.gradient_per_radian(rgb) * min(sigma_rad, np.pi)) ** 2
     view = ViewMap(rgb, variance, coverage.astype(float), coverage, turn.values[..., 4] / safe)
     numbers = {name: light.numbers | {"orientation_sigma_deg": float(np.degrees(sigma_rad))}, "scale": found.numbers}
     evidence = [*found.evidence, parallax(probe)]
-    return Observation({name: view}, centre, {}, numbers, [*light.warnings, *found.warnings], evidence)
+    warnings = [*light.warnings, *found.warnings]
+    return Observation({name: view}, centre, {}, numbers, warnings, evidence, scale_sigma=found.sigma_rel)
 
 
 def parallax(probe: dict[str, Any]) -> dict[str, Any]:

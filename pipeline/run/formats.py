@@ -139,22 +139,25 @@ def _decode(path: Path) -> np.ndarray:
     return picture
 
 
-def read_latlong(path: Path) -> Raster:
-    """A lat-long map .exr or .hdr (Radiance): R G B as stored, finite or not; space ``unknown`` when not said.
+def read_linear(path: Path) -> Raster:
+    """A linear picture .exr or .hdr (Radiance): R G B as stored, finite or not; space ``unknown`` when not said.
 
     Attributes of a Radiance header are ``exposure`` (1 when not said; radiance is the value over it) and, where given,
-    ``chromaticities``. Raises ArtifactError when the file cannot be read, has no colours, or is not twice as wide as
-    high.
+    ``chromaticities``. Raises ArtifactError when the file cannot be read or has no colours.
     """
-    if path.suffix.lower() == ".exr":
-        raster = read_exr(path)
-        names = ["R", "G", "B"] if {"R", "G", "B"} <= raster.channels.keys() else ["Y"] * 3
-        if not set(names) <= raster.channels.keys():
-            raise ArtifactError(f"{path}: channels are {', '.join(sorted(raster.channels))}; expected R G B or Y")
-        rgb = np.stack([raster.channels[name] for name in names], -1)
-        found = Raster(Raster.split(rgb), raster.space, raster.attributes)
-    else:
-        found = _read_radiance(path)
+    if path.suffix.lower() != ".exr":
+        return _read_radiance(path)
+    raster = read_exr(path)
+    names = ["R", "G", "B"] if {"R", "G", "B"} <= raster.channels.keys() else ["Y"] * 3
+    if not set(names) <= raster.channels.keys():
+        raise ArtifactError(f"{path}: channels are {', '.join(sorted(raster.channels))}; expected R G B or Y")
+    rgb = np.stack([raster.channels[name] for name in names], -1)
+    return Raster(Raster.split(rgb), raster.space, raster.attributes)
+
+
+def read_latlong(path: Path) -> Raster:
+    """`read_linear` of a map of all directions. Raises ArtifactError, too, when it is not twice as wide as high."""
+    found = read_linear(path)
     height, width = found.shape
     if width != 2 * height:
         raise ArtifactError(f"{path}: is {width} x {height}; expected a lat-long map, twice as wide as high; crop none")

@@ -95,8 +95,48 @@ class PanoramaFacts(LatLongFacts):
     point_sigma_px: Length = Field(3.0, description="standard uncertainty of a click")
 
 
+class FisheyeFacts(Strict):
+    """One hemispherical photograph: its lens, and how it was held."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    files: list[str] = Field([], description="RAW files or globs of its bracket, relative to root")
+    file: str | None = Field(None, description="or one linear picture, .hdr or .exr")
+    projection: Literal["equidistant", "equisolid", "stereographic"] = Field(
+        "equidistant", description="radius as angle, sine of half of it, or tangent of half of it"
+    )
+    fov_deg: float = Field(gt=60, le=280, description="angle across the image circle")
+    radius_px: Length = Field(description="radius of the image circle")
+    centre_px: tuple[Coordinate, Coordinate] | None = Field(None, description="its centre; None: the picture's")
+    yaw_deg: Coordinate | None = Field(None, description="of the axis about +Y, counter-clockwise from above, 0 to +Z")
+    pitch_deg: Coordinate = Field(0.0, description="of the axis above the horizon")
+    roll_deg: Coordinate = Field(0.0, description="of the camera about its axis, clockwise as it looks")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> FisheyeFacts:
+        if bool(self.files) == bool(self.file):
+            raise ValueError("expected either files (RAW) or file (.hdr, .exr)")
+        return self
+
+
+class FisheyePairFacts(LightFacts):
+    """Fisheye photographs that together see all around."""
+
+    kind: Literal["fisheye_pair"]
+    fisheye: list[FisheyeFacts] = Field(min_length=1, max_length=4, description="two hemispheres, usually")
+    space: Literal["linear_rec709", "acescg"] | None = Field(None, description="colour space of files, as of a map")
+    orientation_sigma_deg: float = Field(1.0, ge=0, le=180, description="standard uncertainty of stated rotations")
+
+    @model_validator(mode="after")
+    def _unique(self) -> FisheyePairFacts:
+        names = [one.name for one in self.fisheye]
+        if "plate" in names or len(set(names)) < len(names):
+            raise ValueError(f"fisheye names are {names}; each must be unique and none may be 'plate'")
+        return self
+
+
 PROBE_KINDS: dict[str, type[Strict]] = {
     "mirror_ball": MirrorBallFacts, "grey_ball": GreyBallFacts, "map": MapFacts, "panorama": PanoramaFacts,
+    "fisheye_pair": FisheyePairFacts,
 }  # fmt: skip
 BALL_KINDS = ("mirror_ball", "grey_ball")
 
@@ -111,7 +151,8 @@ ProbeFacts = Annotated[
     Annotated[MirrorBallFacts, Tag("mirror_ball")]
     | Annotated[GreyBallFacts, Tag("grey_ball")]
     | Annotated[MapFacts, Tag("map")]
-    | Annotated[PanoramaFacts, Tag("panorama")],
+    | Annotated[PanoramaFacts, Tag("panorama")]
+    | Annotated[FisheyePairFacts, Tag("fisheye_pair")],
     Discriminator(
         _probe_kind, custom_error_type="probe_kind",
         custom_error_message="expected one of " + ", ".join(PROBE_KINDS),
