@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 from agreement import tile_means
@@ -15,13 +16,24 @@ from pipeline.camera.lens import ray_grid
 from pipeline.light.environment import irradiance
 from pipeline.transport import passes
 from pipeline.transport.difference import difference_block
-from pipeline.transport.estimate import TRUSTED, Canvas, Effort, lit, pictures, prepare, sampled
-from pipeline.transport.meshes import Material
+from pipeline.transport.estimate import (
+    TRUSTED,
+    Canvas,
+    Effort,
+    Pilot,
+    lit,
+    looked,
+    pictures,
+    prepare,
+    sampled,
+    settled,
+)
+from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.passes import OBJECT_BOOST, Halves
-from pipeline.transport.region import BLUR, CELL, Limits, limits_for
+from pipeline.transport.region import BLUR, CELL, Limits, limits_for, near_objects
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import material_bsdf, object_shape
-from pipeline.transport.trace import Rays, Samples, trace
+from pipeline.transport.trace import LensRays, Rays, Samples, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter
 from stages import render
@@ -60,7 +72,7 @@ def adaptive() -> tuple[Canvas, Halves, dict[str, float], Limits]:
     effort = Effort(samples=SAMPLES, denoise=False, seed=5)
     canvas, left = prepare(worlds, rays, FRAME, upward(sky()), sigma, float(plate.max()), limits, effort)
     *_, shot = sampled(canvas)
-    return canvas, shot.halves, left, limits
+    return shot.canvas, shot.halves, left, limits
 
 
 def relative(change: np.ndarray) -> np.ndarray:
@@ -96,6 +108,70 @@ def test_adaptive_differs_by_no_more_than_its_numbers_say() -> None:
     bent = limits.tolerance * (4 * BLUR**2 + 1)
     assert np.all(error[interpolated] < bent + limits.threshold + noise[interpolated])
     assert np.median(error[interpolated]) < limits.tolerance / 20
+
+
+def wide(scale: int) -> Pilot:
+    """Of a small ball and a thin rod in a frame of 30 by 40 cells, or ``scale`` times as many each way."""
+    light, mi = sky(), use_mitsuba()
+    rod = Mesh(*quads_of_rod(), None, GREY)
+    shapes = {
+        "ball": placed("ball", sphere(0.01, (0, 0.01, 0.05), GREY), material_bsdf(mi, GREY, "acescg")),
+        "rod": placed("rod", rod, material_bsdf(mi, GREY, "acescg")),
+    }
+    worlds = build_worlds(ground(), ALBEDO, light, shapes, emitters=[lamp_of(light)])
+    height, width = (scale * CELL * cells for cells in (30, 40))
+    camera = Camera(width=width, height=height, fx=600.0, fy=600.0, cx=width / 2, cy=height / 2)
+    rays = LensRays(camera, looking_down())
+    effort, limits = Effort(samples=32, seed=3), Limits(0.01, 0.005, 0.01)
+    return looked(worlds, rays, (height, width), upward(light), limits, effort, None, lambda share: None)
+
+
+def quads_of_rod() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A rod of half a millimetre, an upright strip: its shadow is thinner than a cell."""
+    corners = np.array([[0.03, 0, 0], [0.0305, 0, 0], [0.0305, 0.06, 0], [0.03, 0.06, 0]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.0, 0, 1], (4, 1))
+
+
+def test_what_gets_no_more_than_a_glance_does_not_change() -> None:
+    """Against 256 samples of every cell: object and hard shadow lie near the spheres, the rest is below the threshold.
+
+    Five standard errors of the 256 samples are allowed. A frame nine times as large has no more to look at.
+    """
+    pilot, large = wide(1), wide(3)
+    all_cells = trace(difference_block, pilot.worlds, pilot.rays, 256, 4, 9, CELL)
+    change, noise = all_cells.lost + all_cells.gained, np.sqrt(all_cells.change_variance)
+    near = near_objects(pilot.worlds, pilot.rays)
+    assert 0.01 < near.mean() < 0.3
+    assert near[all_cells.alpha > 0].all()
+    assert (all_cells.alpha > 0).sum() > 10
+    model = ALBEDO * upward(sky()) / np.pi
+    assert near[(change < -0.25 * model).all(1)].all()
+    assert np.all((np.abs(change) < 0.01 * model + 5 * noise)[pilot.glanced])
+    assert large.glanced.mean() > 0.8
+    assert abs((~large.glanced).sum() - (~pilot.glanced).sum()) < 0.3 * (~large.glanced).sum()
+
+
+def test_the_pilot_grows_where_it_stands_for_pixels() -> None:
+    """After the first picture its noise falls where it is more than interpolation may err; traced pixels stay.
+
+    From 128 samples to 512: a quarter of the variance, up to what strata do to its estimate.
+    """
+    worlds, rays, _ = truth()
+    limits, effort = Limits(0.01, 3e-3, 0.01), Effort(samples=64, seed=4)
+    first, _ = prepare(worlds, rays, FRAME, upward(sky()), np.full(FRAME, 0.01), 1.0, limits, effort)
+    assert first.pilot is not None
+    assert settled(replace(first, pilot=replace(first.pilot, tolerance=1.0)), lambda share: None).region is first.region
+    first = replace(first, pilot=replace(first.pilot, tolerance=0.0))
+    assert first.pilot is not None
+    cells = first.pilot.too_noisy(first.region)
+    assert len(cells) > 10
+    after, again = (settled(first, lambda share: None) for _ in range(2))
+    assert np.array_equal(after.region.lost, again.region.lost)
+    assert np.array_equal(after.region.traced, first.region.traced)
+    before, now = (
+        canvas.region.variance.reshape(-1, 3)[first.pilot.index[cells]].max(1).mean() for canvas in (first, after)
+    )
+    np.testing.assert_allclose(now / before, 128 / 512, rtol=0.5)
 
 
 def test_the_regions_border_is_hidden_by_the_photographs_noise() -> None:
