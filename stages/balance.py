@@ -188,14 +188,16 @@ def corrections(balances: dict[str, Balance], grey: estimate.Gains | None) -> st
     for view, balance in balances.items():
         there, back = f"{view}_to_plate", f"plate_to_{view}"
         slopes |= {there: balance.gains, back: 1 / balance.gains}
-        source = ", ".join(balance.references) or "assumed"
+        source = ", ".join(balance.references) or "no reference"
         sigma = " ".join(f"{100 * value:.2f}" for value in sigma_of(balance.covariance))
         state = "applied to the light" if balance.applied else "not applied"
-        said[there] = f"{view} at the plate's exposure and colour, from {source}; sigma {sigma} percent; {state}"
+        said[there] = f"{view} brought to the plate by {source}; sigma {sigma} percent; {state}"
         said[back] = f"undoes {there}"
     if grey is not None:
         slopes |= {"plate_to_neutral": np.exp(grey.log), "neutral_to_plate": np.exp(-grey.log)}
-        said["plate_to_neutral"] = "makes the plate's grey references neutral, luminance kept; offered, not applied"
+        said["plate_to_neutral"] = (
+            "makes the grey references of the plate neutral, luminance kept; offered, not applied"
+        )
         said["neutral_to_plate"] = "undoes plate_to_neutral"
     if not slopes:  # a probe without photographs: the format has no empty collection
         slopes, said = {"plate_unchanged": np.ones(3)}, {"plate_unchanged": "no view but the plate; nothing to correct"}
