@@ -195,12 +195,8 @@ def corrections(balances: dict[str, Balance], grey: estimate.Gains | None) -> st
         said[back] = f"undoes {there}"
     if grey is not None:
         slopes |= {"plate_to_neutral": np.exp(grey.log), "neutral_to_plate": np.exp(-grey.log)}
-        said["plate_to_neutral"] = (
-            "makes the grey references of the plate neutral, luminance kept; offered, not applied"
-        )
+        said["plate_to_neutral"] = "makes the plate as grey as its references, luminance kept; offered, not applied"
         said["neutral_to_plate"] = "undoes plate_to_neutral"
-    if not slopes:  # a probe without photographs: the format has no empty collection
-        slopes, said = {"plate_unchanged": np.ones(3)}, {"plate_unchanged": "no view but the plate; nothing to correct"}
     return cdl_collection(slopes, said, "ACEScg")
 
 

@@ -12,7 +12,6 @@ import pytest
 from pipeline.camera.markers import apply, square_homography
 from pipeline.conventions import CLIPPED
 from pipeline.image import balance as estimate
-from pipeline.image.display import cdl_collection
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.manifest import load_capture
 from pipeline.types import Balance, Bracket, Frame, Raster
@@ -228,6 +227,8 @@ def test_without_a_reference_the_gains_are_one_and_how_sure_that_is_is_said(shot
     assert two.numbers["ball"]["exposure_sigma_rel"] > 0.05
     assert "unknown" in two.evidence[0]["because"]
     assert (other.gains == 1).all()
+    assert estimate.shared_sigma(two.outputs["balance"], "ball") == pytest.approx(np.full(3, np.hypot(0.05, 0.05)))
+    assert (estimate.shared_sigma({}, "ball") == 0).all()
     assert stage([], {"plate": shots["plate"]}).outputs["balance"] == {}
 
 
@@ -309,8 +310,8 @@ def test_the_neutral_plate_is_grey_as_the_card_and_as_bright(shots):
         assert seen / seen.mean() == pytest.approx(colour / colour.mean(), rel=3e-3)  # the light's colour changes on it
 
 
-def test_a_collection_may_be_empty():
-    assert "ColorCorrectionCollection" in cdl_collection({}, {}, "ACEScg")
+def test_a_collection_may_be_empty(shots):
+    assert "ColorCorrectionCollection" in stage([], {"plate": shots["plate"]}).outputs["corrections"]
 
 
 # ---- what capture.toml may say ---------------------------------------------------------------------------------------

@@ -262,6 +262,11 @@ def chart_residual(plate: Cells, view: Cells, gains: Gains) -> float:
     return float(np.sqrt((log[known].mean(1) ** 2).mean())) if known.any() else np.nan
 
 
+def shared_sigma(balance: dict[str, Balance], view: str) -> np.ndarray:
+    """(3,) relative error that all pixels of a view share: of its gains, applied or not; zeros for an unknown view."""
+    return np.sqrt(np.diag(balance[view].covariance)) if view in balance else np.zeros(3)
+
+
 def balanced(photographs: dict[str, Raster], balance: dict[str, Balance]) -> dict[str, Raster]:
     """The photographs at the plate's exposure and colour: radiance and variance of views whose gains are applied."""
     done = dict(photographs)
