@@ -83,7 +83,7 @@ def test_weights_are_within_a_percent_of_the_best_possible(pairs):
             error = ((rgb[plain] / truth[plain] - 1) ** 2).mean(-1)
             squares[name].append(float(np.average(error, weights=latlong_solid_angles(128, 256)[plain])))
     rms = {name: np.sqrt(np.mean(values)) for name, values in squares.items()}
-    assert rms["merge"] < 1.01 * rms["best"]  # measured 1.002
+    assert rms["merge"] < 1.01 * rms["best"]  # measured 1.008; 1.002 over forty skies
     assert rms["merge"] < 0.98 * rms["direction alone"]  # measured 0.97 here, 0.88 over forty skies
 
 
