@@ -22,7 +22,6 @@ from pipeline.camera.rigid import difference
 from pipeline.conventions import transform_points
 from pipeline.image import metrics
 from pipeline.image.balance import balanced
-from pipeline.image.colour import convert
 from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
 from pipeline.light import prediction
@@ -203,9 +202,6 @@ def self_check(
     balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster,
 ) -> dict[str, Any]:  # fmt: skip
     """Predictions beside photographs. Every figure is a median relative (or absolute, for ratios) error."""
-    probe = facts["probe"]
-    stated = probe.get("reflectance", (1.0, 1.0, 1.0)), probe.get("reflectance_space", "acescg")  # mirror balls' only
-    reflectance = convert(np.asarray(stated[0], float), stated[1], "acescg")
     light = environment.rgb()
     checks: dict[str, Any] = {"ball": {}, "shadow": {}}
     maps = {}
@@ -215,16 +211,14 @@ def self_check(
         directions, sine = prediction.ball_directions(lens, ball, views[name].world_from_camera, rows, columns)
         photograph, bad = photographs[name].rgb()[rows, columns], photographs[name]["mask"][rows, columns] != 0
         used = (sine < BALL_LIMIT) & ~bad
-        predicted = prediction.mirrored_picture(light, directions, reflectance)
+        predicted = prediction.mirrored_picture(light, directions, prediction.ball_reflectance(ball, sine))
         error = metrics.relative((predicted - photograph)[used], photograph[used])
         median = float(np.median(error)) if used.any() else None
         checks["ball"][name] = {"median_rel_err": median, "pixels": int(used.sum()), "in_sample": True}
         maps[name] = prediction.splat(directions[used], photograph[used], *PAIR_MAP)
         stayed = np.allclose(views[name].world_from_camera, views["plate"].world_from_camera, atol=1e-9)
         if stayed and views[name].camera is None:
-            checks["shadow"][name] = shadow_check(
-                photographs, name, camera, views[name], ball, light, plane, reflectance
-            )
+            checks["shadow"][name] = shadow_check(photographs, name, camera, views[name], ball, light, plane)
     checks["pairs"] = pair_check(maps)
     if facts.get("board"):
         checks["paper"] = paper_check(facts["board"], plane, albedo)
@@ -252,7 +246,7 @@ def pair_check(maps: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]
 
 def shadow_check(
     photographs: dict[str, Raster], name: str, camera: Camera, view: View, ball: BallFit, light: np.ndarray,
-    plane: Plane, reflectance: np.ndarray,
+    plane: Plane,
 ) -> dict[str, Any]:  # fmt: skip
     """The ball's shadow on the plane, predicted from the map and measured as ball photograph over plate.
 
@@ -272,7 +266,9 @@ def shadow_check(
     )
     if not usable.any():
         return {"points": 0}
-    blocked, mirrored = prediction.ball_shadow(light, points[usable], plane.normal, centre, ball.radius_m, reflectance)
+    blocked, mirrored = prediction.ball_shadow(
+        light, points[usable], plane.normal, centre, ball.radius_m, ball.reflectance
+    )
     far = np.abs(mirrored - 1).max(-1) < UNCHANGED
     gain = np.median(measured[usable][far] / mirrored[far], axis=0) if far.any() else np.ones(3)
     seen = (measured[usable] / gain).mean(-1)
