@@ -20,7 +20,8 @@ from pipeline.image import jpeg
 from pipeline.image.colour import convert
 from pipeline.light.emitters import lights
 from pipeline.probes import cropped
-from pipeline.probes.unwrap import samples_per_axis, unwrap
+from pipeline.probes.mirror_geometry import Mirror
+from pipeline.probes.unwrap import unwrap
 from pipeline.run import formats
 from pipeline.run.errors import ManifestError
 from pipeline.types import Raster
@@ -57,11 +58,10 @@ def ball(
     rgb = convert(merged.rgb, "linear_rec709", "acescg")
     matrix = convert(np.eye(3), "linear_rec709", "acescg")  # rows: what each channel gives to the others
     variance = merged.variance @ matrix**2
-    picture = np.concatenate([rgb, variance, merged.clipped[..., None]], -1)
-    count = samples_per_axis(width, circle.radius, 3)
-    found = unwrap(
-        picture, camera, cropped.WORLD_FROM_CAMERA, centre, 1.0, width // 2, width, count, RIM
-    )  # fmt: skip
+    channels = np.concatenate([rgb, variance, merged.clipped[..., None]], -1).astype(np.float32)
+    mirror = Mirror(camera, cropped.WORLD_FROM_CAMERA[:3, :3].T, centre, 1.0, RIM)
+    valid = np.ones(merged.clipped.shape, np.float32)
+    found = unwrap(valid, list(np.moveaxis(channels, -1, 0).copy()), mirror, width // 2, width)
     values = found.values
     environment = Raster(
         {
