@@ -11,14 +11,14 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
-from pipeline.probes import reflection, sphere_fit
+from pipeline.probes import reflection
 from pipeline.probes.combine import merge
 from pipeline.probes.filling import fill
 from pipeline.probes.levelling import relative_exposure
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import ViewMap
 from pipeline.probes.photographer import toward_photographer
-from pipeline.probes.unwrap import method_for, unwrap
+from pipeline.probes.unwrap import unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
 from stages import knobs, probe
@@ -109,9 +109,8 @@ def unwrapped(place: Place, camera: Camera, pose: np.ndarray, height: int = 64, 
     picture = photograph(place, camera, pose, split)
     centre = transform_points(invert_rigid(pose), np.array(place.ball))
     mirror = Mirror(camera, invert_rigid(pose)[:3, :3], centre, RADIUS, 0.97)
-    method = method_for(sphere_fit.radius_in_pixels(camera, centre, RADIUS), 2 * height)
     channels = [np.float32(picture[..., i]) for i in range(3)]
-    return unwrap(np.ones(picture.shape[:2], np.float32), channels, mirror, height, 2 * height, method)
+    return unwrap(np.ones(picture.shape[:2], np.float32), channels, mirror, height, 2 * height)
 
 
 @pytest.mark.parametrize("name", ["+x", "-x", "+y", "-y", "+z", "-z"])
@@ -183,7 +182,7 @@ def run(shots: dict[str, Any], *balls: tuple[str, bool], width: int = 256):
     used = ["plate", *(name for name, _ in balls)]
     photographs = {name: shots["photographs"][name] for name in used}
     return probe.compute(
-        facts(*balls), photographs, shots["camera"], shots["views"], {}, knobs.Probe(width=width, supersample=2)
+        facts(*balls), photographs, shots["camera"], shots["views"], {}, {}, knobs.Probe(width=width, supersample=2)
     )
 
 

@@ -26,6 +26,13 @@ def bilinear(groups: list[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarr
     return np.concatenate([f.reshape(*x.shape, -1) for f in found], -1)
 
 
+def enlarged(picture: np.ndarray, factor: int) -> np.ndarray:
+    """A float32 picture (H, W) with ``factor`` times as many pixels along each side, bilinear between their centres."""
+    import cv2
+
+    return cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
+
+
 def summed_areas(picture: np.ndarray, out: np.ndarray) -> None:
     """Into ``out`` (H + 1, W + 1, C) float64: sums of a float32 picture (H, W, C) above and left of each corner."""
     import cv2

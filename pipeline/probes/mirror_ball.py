@@ -14,14 +14,14 @@ import numpy as np
 
 from pipeline.conventions import CLIPPED, invert_rigid, latlong_solid_angles
 from pipeline.probes import combine, photographer, sphere_fit
-from pipeline.probes.ball_evidence import examine, without
+from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.parallax import set_down
 from pipeline.probes.reflection import blind_half_angle, deviation, radians_per_pixel
-from pipeline.probes.unwrap import displaced_variance, method_for, unwrap
+from pipeline.probes.unwrap import displaced_variance, unwrap
 from pipeline.types import BallFit, Camera, Raster, View
 
 PIXEL_SIGMA = 0.5  # px: half-width of pixel and lookup, for the angular resolution of a texel
@@ -65,13 +65,17 @@ class MirrorBall:
             for name, view in maps.items()
         }
         maps, people = photographer.shade(maps, to_camera, tripod)
+        glass = facts["probe"].get("glass_mm")
+        shaped = shape(maps, known.dents, None if glass is None else 1e-3 * float(glass), radius)
+        warnings += shaped.warnings
         numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) | people.get(name, {}) for name in names}
         balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
         evidence = [*reasons(found), photographer.reason(people, len(maps)), *known.evidence]
         return Observation(
-            maps, centre, balls, numbers | known.numbers, warnings, evidence, scale_sigma=known.surface.sigma
-        )
+            shaped.maps, centre, balls, numbers | known.numbers | shaped.numbers, warnings,
+            [*evidence, *shaped.evidence], scale_sigma=known.surface.sigma, smooth_only=shaped.smooth_only,
+        )  # fmt: skip
 
 
 def view_map(
@@ -88,7 +92,7 @@ def view_map(
     rim = min(grid.rim, usable_rim(fit, radius))
     mirror = Mirror(part, rotation, fit.centre, radius, rim)
     valid, channels = lookup_planes(photograph, window)
-    shown = unwrap(valid, channels, mirror, height, width, method_for(fit.radius_px, width))
+    shown = unwrap(valid, channels, mirror, height, width)
     sine, direction = texel_directions(mirror, height, width, fit.covariance, view.covariance[:3, :3])
     reflectance = surface.at(sine).astype(np.float32)
     rgb = shown.values[..., :3] / reflectance

@@ -11,7 +11,7 @@ import functools
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,6 +55,12 @@ class Mirror:
     def axis(self) -> np.ndarray:
         """(3,) unit direction from the camera to the centre, camera frame."""
         return self.centre / np.linalg.norm(self.centre)
+
+    def enlarged(self, factor: int) -> Mirror:
+        """The same ball in a picture with ``factor`` times as many pixels along each side."""
+        camera = self.camera
+        scaled = {name: factor * getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        return replace(self, camera=camera.model_copy(update=scaled))
 
     @functools.cached_property
     def table(self) -> np.ndarray:

@@ -1,9 +1,8 @@
 """From a photographed mirror ball to a lat-long map: solid-angle means over texels of what the ball shows.
 
-Two ways to the same integral. Where the ball is finer than the map, its pixels are splat: each spreads its radiance
-over the solid angle it mirrors (`pipeline.probes.area_sums`), so lamps keep their energy exactly. Where it is coarser,
-texels gather bilinear lookups, spaced by half a pixel at most, which is smooth; energy is then kept to the curvature
-of the solid angle over a pixel.
+Pixels are splat: each spreads its radiance over the solid angle it mirrors (`pipeline.probes.area_sums`), so lamps
+neither alias nor lose energy. Where the ball is coarser than the map its picture is first enlarged, bilinear, so that
+texels do not show its pixels as blocks; energy is then kept to the curvature of the solid angle over a pixel.
 
 Variance has parts that are shared differently. Photon noise (`Unwrapped.spread` times the pixels' variance) is each
 pixel's own: only neighbours that look up the same pixels share it. The direction's (`displaced_variance`) comes from
@@ -19,14 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.conventions import latlong_solid_angles
-from pipeline.light.sampling import bilinear, planes
+from pipeline.light.sampling import enlarged
 from pipeline.probes.area_sums import area_sums
 from pipeline.probes.mirror_geometry import BAND_TEXELS, WORKERS, Mirror, bands, corners
 
-FINE_PX = 1.0  # pixels per texel along a side, face on, from which on the ball counts as finer than the map
-GATHER_PX = 0.5  # largest step of lookups
+FINE_PX = 1.0  # pixels per texel along a side, face on, from which on the ball is not enlarged
+MOST = 8  # times that it is enlarged: blocks of a ball that is coarser still are no worse than its blur
 KERNEL_FIT = 0.94  # of the Gaussian that stands for texel and pixel below: within 6 % of boxes and tents of 0 to 5 px
-PIXEL_KERNEL = {"splat": 1 / 12, "gather": 1 / 6}  # variance [px^2] along an axis: pixels are boxes, lookups tents
+BOX, TENT = 1 / 12, 1 / 6  # variance [px^2] along an axis of a pixel, and of one that was enlarged
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,35 +41,37 @@ class Unwrapped:
     coverage: np.ndarray
     pixels: np.ndarray
     spread: np.ndarray
-    method: str
 
 
-def method_for(radius_px: float, width: int) -> str:
-    """``splat`` for a ball finer than the map, else ``gather``: a pixel's side in its middle mirrors 2 / radius rad."""
-    return "splat" if np.pi / width * radius_px > FINE_PX else "gather"
+def enlargement(mirror: Mirror, width: int) -> int:
+    """How many times the picture is enlarged: until a pixel in the ball's middle, 2 / radius rad, is a texel's size."""
+    radius_px = max(mirror.camera.fx, mirror.camera.fy) * np.tan(np.arcsin(mirror.ratio))
+    return int(np.clip(np.ceil(FINE_PX * width / (np.pi * radius_px)), 1, MOST))
 
 
 def unwrap(
-    valid: np.ndarray, channels: list[np.ndarray], mirror: Mirror, height: int, width: int, method: str
+    valid: np.ndarray, channels: list[np.ndarray], mirror: Mirror, height: int, width: int, factor: int | None = None
 ) -> Unwrapped:
     """Lat-long map (height, width), world frame, of the ball in a picture; radiance as photographed.
 
     ``valid`` (h, w) float32, 1 where the channels are known; ``channels`` (h, w) float32 each, zero elsewhere. Pixels
-    beyond the mirror's rim are left out. ``method``: ``splat`` or ``gather``, see `method_for`.
+    beyond the mirror's rim are left out. ``factor`` overrides `enlargement`.
     """
+    factor = enlargement(mirror, width) if factor is None else factor
     edges = corners(mirror, height, width)
-    if method == "splat":
-        sums = area_sums([valid, *channels], mirror, edges)
-        whole = latlong_solid_angles(height, width).astype(np.float32)
-    else:
-        sums, whole = _gather([valid, *channels], mirror, edges)
-    weight = sums[..., 0]
+    pixels, spread = footprint(edges[0], edges[1], BOX if factor == 1 else TENT)
+    layers = [valid, *channels]
+    if factor > 1:
+        layers = [enlarged(layer, factor) for layer in layers]
+        mirror = mirror.enlarged(factor)
+        edges = (edges[0] * factor, edges[1] * factor, edges[2])
+    sums = area_sums(layers, mirror, edges)
+    whole = latlong_solid_angles(height, width).astype(np.float32)
+    weight, values = sums[..., 0], sums[..., 1:]
     weight[weight < 1e-5 * whole] = 0  # slivers: rounding
-    values = sums[..., 1:]
     values *= np.where(weight > 0, 1 / np.where(weight > 0, weight, 1), 0)[..., None]
     coverage = np.minimum(weight / whole, 1)
-    pixels, spread = footprint(edges[0], edges[1], PIXEL_KERNEL[method])
-    return Unwrapped(values, coverage, pixels, spread / np.maximum(coverage, 1e-3), method)
+    return Unwrapped(values, coverage, pixels, spread / np.maximum(coverage, 1e-3))
 
 
 def footprint(x: np.ndarray, y: np.ndarray, kernel: float) -> tuple[np.ndarray, np.ndarray]:
@@ -85,41 +86,6 @@ def footprint(x: np.ndarray, y: np.ndarray, kernel: float) -> tuple[np.ndarray, 
     determinant = (xx + kernel) * (yy + kernel) - xy * xy
     spread = KERNEL_FIT / (4 * np.pi * np.sqrt(determinant))
     return np.abs(ux * vy - uy * vx).astype(np.float32), spread.astype(np.float32)
-
-
-def _gather(
-    channels: list[np.ndarray], mirror: Mirror, edges: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums (H, W, C) of weight times lookup, weights the sine of the latitude's angle; and of the weights (H, W)."""
-    height, width = edges[0].shape[0] - 1, edges[0].shape[1] - 1
-    groups = planes(np.stack(channels, -1))
-    focal = max(mirror.camera.fx, mirror.camera.fy)
-    count = max(2, int(np.ceil(np.pi / width * focal * np.tan(np.arcsin(mirror.ratio)) / GATHER_PX)))
-    sums = np.zeros((height, width, len(channels)), np.float32)
-    whole = np.zeros((height, width), np.float32)
-    with ThreadPoolExecutor(WORKERS) as pool:
-        blocks = bands(height, BAND_TEXELS // width)
-        list(pool.map(lambda b: _gather_band(groups, mirror, edges, b, count, sums[b], whole[b]), blocks))
-    return sums, whole
-
-
-def _gather_band(
-    groups: list[np.ndarray], mirror: Mirror, edges: tuple[np.ndarray, np.ndarray, np.ndarray], block: slice,
-    count: int, sums: np.ndarray, whole: np.ndarray,
-) -> None:  # fmt: skip
-    """Some rows of `_gather`, into ``sums`` and ``whole``; positions are bilinear between the texel's corners."""
-    height = edges[0].shape[0] - 1
-    camera, limit = mirror.camera, np.arcsin(mirror.rim)
-    lines = [e[block.start : block.stop + 1] for e in edges]
-    for dv in (np.arange(count) + 0.5) / count:
-        row = [e[:-1] + dv * (e[1:] - e[:-1]) for e in lines]
-        sine = np.sin(np.pi * (np.arange(block.start, block.stop) + dv) / height).astype(np.float32)[:, None]
-        for du in (np.arange(count) + 0.5) / count:
-            x, y, angle = (e[:, :-1] + du * (e[:, 1:] - e[:, :-1]) for e in row)
-            inside = (x >= 0.5) & (x <= camera.width - 0.5) & (y >= 0.5) & (y <= camera.height - 0.5)
-            weight = sine * (inside & (angle <= limit))
-            sums += weight[..., None] * bilinear(groups, np.where(inside, x, 0), np.where(inside, y, 0))
-            whole += sine
 
 
 def displaced_variance(rgb: np.ndarray, direction: np.ndarray, coverage: np.ndarray) -> np.ndarray:
