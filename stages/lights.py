@@ -2,9 +2,9 @@
 
 A light is a connected set of the map's texels that stands out sharply, is narrow, and carries a share of the light that
 matters (`pipeline.light.emitters`). Nothing is fitted or moved: the light of a group is the map on its texels, so that
-lights and sky sum to the map exactly, and what the probe measured stays what is rendered. Limits: a lamp is as sharp as
-the probe saw it; light is distant; windows and tubes that are wide stay in the sky, which the renderer samples by
-brightness.
+lights and sky sum to the map exactly, and what the probe measured stays what is rendered. What was clipped and not
+recovered is said to be a lower bound. Limits: a lamp is as sharp as the probe saw it; light is distant; windows and
+tubes that are wide stay in the sky, which the renderer samples by brightness.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.environment import total_energy
 from pipeline.run.artifacts import EMITTERS, ENVIRONMENT
@@ -20,7 +21,13 @@ from pipeline.run.stage import Stage
 from pipeline.types import Emitter, Raster, Result
 from stages import knobs
 
+CLIPPED_PART = 0.05  # of a texel that is clipped: from here on it is a lower bound
 MOST = 4  # lights that are told apart: each costs the renderer a shadow ray
+COSTS = {
+    "measured": "nothing: its texels are the map's",
+    "recovered": "its sigma: it was clipped, and its flux comes from what it does to known surfaces",
+    "clipped": "all that it is brighter than its clipped value",
+}
 # A sun, by what no lamp in a room is at once: the only light, above, a disc of half a degree as a probe blurs it, and
 # brighter than the mean of all else by this.
 SUN_HALF_ANGLE_DEG, SUN_CONTRAST = 2.0, 100.0
@@ -36,6 +43,8 @@ def compute(environment: Raster, params: knobs.Lights) -> Result:
         Emitter(
             name="sun" if sun else f"lamp_{number}", direction=patch.direction, solid_angle_sr=patch.solid_angle_sr,
             half_angle_rad=patch.half_angle_rad, irradiance=patch.irradiance, texels=patch.texels,
+            irradiance_sigma=irradiance_sigma(environment, patch), lower_bound=source(environment, patch) == "clipped",
+            evidence=source(environment, patch),
         )
         for number, patch in enumerate(kept, 1)
     ]  # fmt: skip
@@ -43,12 +52,39 @@ def compute(environment: Raster, params: knobs.Lights) -> Result:
         emitter.name: {
             "share": patch.share, "half_angle_deg": float(np.degrees(patch.half_angle_rad)), **angles(patch),
             "irradiance": patch.irradiance.tolist(), "texels": len(patch.texels),
+            "irradiance_sigma": emitter.irradiance_sigma.tolist(), "lower_bound": emitter.lower_bound,
         }
         for emitter, patch in zip(emitters, kept, strict=True)
     }  # fmt: skip
     numbers["sky"] = {"share": 1 - sum(patch.share for patch in kept)}
     warnings = [f"{name(patch)} is left in the sky: only the {MOST} strongest lights are told apart" for patch in rest]
+    warnings += [f"{one.name} is clipped: its irradiance is a lower bound" for one in emitters if one.lower_bound]
     return Result({"emitters": emitters}, numbers, warnings, evidence(emitters, kept, wide, params))
+
+
+def source(environment: Raster, patch: Patch) -> str:
+    """Where the brightness of a light comes from: measured, recovered by the probe stage, or clipped."""
+    if "clipped" not in environment.channels:
+        return "measured"
+    over = environment["clipped"].ravel()[patch.texels] > CLIPPED_PART
+    if not over.any():
+        return "measured"
+    return "recovered" if environment["recovered"].ravel()[patch.texels][over].all() else "clipped"
+
+
+def irradiance_sigma(environment: Raster, patch: Patch) -> np.ndarray:
+    """Sigma (3,) of a light's irradiance; zero for a map without variance.
+
+    The texels of a recovered flux share one error, so that their sigmas add; those of other texels are independent.
+    """
+    if "variance.R" not in environment.channels:
+        return np.zeros(3)
+    height, width = environment.shape
+    directions = latlong_directions(height, width).reshape(-1, 3)[patch.texels]
+    weight = latlong_solid_angles(height, width).ravel()[patch.texels] * (directions @ patch.direction)
+    sigma = weight[:, None] * np.sqrt(np.maximum(environment.rgb("variance").reshape(-1, 3)[patch.texels], 0))
+    shared = environment.channels.get("recovered", np.zeros((height, width))).ravel()[patch.texels] > 0
+    return np.asarray(np.hypot(sigma[shared].sum(0), np.sqrt((sigma[~shared] ** 2).sum(0))))
 
 
 def is_sun(rgb: np.ndarray, found: list[Patch]) -> bool:
@@ -87,7 +123,7 @@ def evidence(
             "term": f"{emitter.name} apart from the sky",
             "modelled": True,
             "because": f"{name(patch)}; {patch.brightness / patch.level:.0f} times brighter than its border",
-            "could_cost": "nothing: its texels are the map's",
+            "could_cost": COSTS[emitter.evidence],
         }
         for emitter, patch in zip(emitters, kept, strict=True)
     ]

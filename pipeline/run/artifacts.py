@@ -48,7 +48,7 @@ BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", t
 ENVIRONMENT = Artifact(
     "environment",
     "raster",
-    "world-oriented lat-long at the ball: R G B, variance.RGB, seen (0..1)",
+    "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1)",
     RADIANCE_UNIT,
     ACESCG,
 )
