@@ -59,6 +59,7 @@ STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": 
 PILOT_SHARE = 8  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
 FIRST_PILOT = 2  # likewise, before the first picture
 LEAST_PILOT, MOST_PILOT = 16, 512  # samples of a cell before the first picture
+CALM = 0.25  # of the tolerance of interpolation: noise of the pilot that need not be less
 GLANCE = 2  # samples of every cell; as many as the first pass takes, so that kernels are compiled once
 GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
@@ -223,11 +224,11 @@ class Pilot:
     tolerance: float  # relative to LS_noobj, see `Limits`
 
     def too_noisy(self, region: Region) -> np.ndarray:
-        """Indices of the cells that stand for their pixels, and are noisier than interpolation may err."""
+        """Indices of the cells that stand for their pixels, and are noisier than a quarter of what is tolerated."""
         stands = (region.weight.ravel()[self.index] > 0) & ~region.traced.ravel()[self.index] & ~self.glanced
         known = stands & (self.model > 0).all(1)
         relative = self.samples.change_variance[known] / self.model[known] ** 2
-        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > self.tolerance]
+        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > CALM * self.tolerance]
 
 
 def settled(canvas: Canvas, progress: Callable[[float], None]) -> Canvas:
