@@ -59,6 +59,9 @@ class Probe(Params):
     rim: float = Field(
         0.999, gt=0.5, lt=1, description="outermost radius that may be used, as a fraction of the ball's"
     )
+    near_budget: float = Field(
+        0.02, ge=0, le=1, description="error of irradiance at the objects beyond which [room] moves the map to them"
+    )
 
 
 class Lights(Params):

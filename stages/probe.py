@@ -13,12 +13,14 @@ import numpy as np
 
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced
+from pipeline.light import near_field
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import combine, filling, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
-from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS
+from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS, WISHES
+from pipeline.run.errors import CaptureError
 from pipeline.run.stage import Stage
 from pipeline.types import Balance, Camera, Harmonics, Raster, Result, View
 from stages import knobs
@@ -26,7 +28,7 @@ from stages import knobs
 
 def compute(
     facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, views: dict[str, View],
-    balance: dict[str, Balance], params: knobs.Probe,
+    balance: dict[str, Balance], wishes: dict[str, Any], params: knobs.Probe,
 ) -> Result:  # fmt: skip
     """Fitted balls, and the light at the probe (H, W) with H = width / 2, world frame."""
     photographs = balanced(photographs, balance)
@@ -48,6 +50,16 @@ def compute(
     gap = filling.prior(rgb, known)
     rgb = filling.fill(rgb, known)
     variance = filling.filled_variance(rgb, variance, known, gap)
+    centre, room = observed.centre_world, near_field.room_of(facts)
+    if room and not room.holds(centre):
+        raise CaptureError(
+            f"room: the probe, at {np.round(centre, 2).tolist()} m, lies outside; correct centre_m, size_m"
+        )
+    near = near_field.assess(rgb, centre, near_field.places_of(wishes, centre[1]), room, params.near_budget)
+    if room and near.target is not None:
+        rgb, variance, rest = near_field.relocate([rgb, variance, seen[..., None]], room.depth, centre, near.target)
+        seen = rest[..., 0]
+    numbers |= near.numbers
     numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
     numbers |= combine.disagreement_numbers(merged) | filling.report(rgb, known, gap)
     numbers |= lamp | map_numbers(rgb, seen)
@@ -58,13 +70,14 @@ def compute(
             "seen": seen.astype(np.float32),
         },
         ACESCG,
-        {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"},
+        {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
+        | near_field.places(centre if near.target is None else near.target, centre),
     )
     harmonics = Harmonics(
         coefficients=sh9_of_environment(rgb), sigma=sh9_sigma(variance), irradiance_factors=COSINE_LOBE
     )
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
-    return Result(outputs, numbers, warnings, [*observed.evidence, *reasons(applied)])
+    return Result(outputs, numbers, [*warnings, *near.warnings], [*observed.evidence, *reasons(applied), near.evidence])
 
 
 def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
@@ -136,6 +149,9 @@ def reasons(applied: list[str]) -> list[dict[str, Any]]:
 
 STAGE = Stage(
     "probe", compute, knobs.Probe,
-    inputs={"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS, "balance": BALANCE},
+    inputs={
+        "facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "views": VIEWS, "balance": BALANCE,
+        "wishes": WISHES,
+    },
     outputs={"balls": BALLS, "environment": ENVIRONMENT, "harmonics": HARMONICS},
 )  # fmt: skip

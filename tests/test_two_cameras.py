@@ -22,6 +22,7 @@ from stages import balance, calibrate, develop, ingest, knobs, merge, pose, prob
 
 OTHER_MATRIX = np.array([[0.95, -0.33, -0.10], [-0.38, 1.15, 0.26], [-0.05, 0.16, 0.55]])
 D65 = colour.xyz_of_xy(colour.REC709_CHROMATICITIES[3])
+DESK = Path(__file__).parents[1] / "sample_captures/desk"
 FASTER = 1.25  # the other body's sensitivity at one ISO
 
 MANIFEST = """
@@ -123,6 +124,17 @@ def test_a_ball_of_another_size_must_state_its_camera(folder):
         ingest.compute(folder, None, knobs.Ingest())
 
 
+def test_another_model_without_a_camera_of_its_own_is_pointed_out(folder):
+    for number in range(2):
+        write_frame(
+            folder / f"ball/{number}.dng", scene(*SIZES["plate"], CARDS["plate"]), 0.1, 0.1, number, model="Two"
+        )
+    text = MANIFEST.replace("camera = { given", "# camera = { given")
+    (folder / "capture.toml").write_text(text)
+    warnings = ingest.compute(folder, None, knobs.Ingest()).warnings
+    assert any("ball: taken with Maker Two, the plate with Maker One; the plate's lens" in text for text in warnings)
+
+
 def test_a_reference_outside_its_photograph_is_refused(folder):
     text = MANIFEST.replace("[[24, 20], [88, 20], [88, 68]", "[[24, 20], [118, 20], [88, 68]")
     (folder / "capture.toml").write_text(text)
@@ -141,6 +153,21 @@ def test_cameras_of_views_are_kept_apart():
     with pytest.raises(ManifestError) as error:
         calibrate.compute({"camera": {"given": given}, "ball": balls}, [], knobs.Calibrate())
     assert "ball[1].camera.given.fy: missing; it is required" in str(error.value)
+
+
+def test_a_balls_own_board_photographs_calibrate_its_camera():
+    files = sorted(DESK.glob("calibration/*.jpg"))
+    given = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
+    facts = {
+        "capture_root": str(DESK), "board": BOARD, "camera": {"given": given, "calibration": []},
+        "ball": [{"name": "b", "camera": {"calibration": ["x"], "given": None}}],
+    }  # fmt: skip
+    photos = [{"file": str(file.relative_to(DESK)), "view": "b"} for file in files]
+    result = calibrate.compute(facts, photos, knobs.Calibrate())
+    assert result.outputs["camera"].fx == 600
+    assert result.outputs["view_cameras"]["b"].fx == pytest.approx(1150, rel=1e-3)  # the desk's true lens
+    assert result.numbers["b"]["rms_px"] < 0.2
+    assert all("(b)" in row["term"] for row in result.evidence[1:])
 
 
 PLATE_CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1)
@@ -206,7 +233,7 @@ def light(shots: dict[str, Any], which: str, balanced: dict[str, Balance]):
                   "reflectance_space": "acescg"},
     }  # fmt: skip
     return probe.compute(
-        facts, shots[which], shots["camera"], shots["views"], balanced, knobs.Probe(width=64, supersample=2)
+        facts, shots[which], shots["camera"], shots["views"], balanced, {}, knobs.Probe(width=64, supersample=2)
     )
 
 

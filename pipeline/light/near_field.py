@@ -25,6 +25,8 @@ PREDICTION_ROWS = 64  # rows of the map on which errors are predicted
 ASSUMED_M = (1.0, 2.0, 4.0)  # distances for which the error is stated when none is known
 SPLIT = 3  # samples per texel and axis; more where the new place looks at the old map from afar
 
+VALID, MEASURED = "insitu:valid_at_m", "insitu:measured_at_m"  # attributes of the map
+
 Depth = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -159,6 +161,33 @@ def assess(
     numbers["near_irradiance_error_left"] = left
     cost = f"{error:.2%} of irradiance; {left:.2%} is left between the objects, and the error of the room's measures"
     return Assessment(target, numbers, [], _reason(True, because, cost))
+
+
+def room_of(facts: dict[str, Any]) -> Room | None:
+    """The box of capture.toml's [room], if there is one."""
+    box = facts.get("room")
+    return box and Room(np.array(box["centre_m"]), np.array(box["size_m"]), float(np.radians(box["yaw_deg"])))
+
+
+def places_of(wishes: dict[str, Any], height: float) -> list[np.ndarray]:
+    """Where the objects are [(3,)], world frame: at ``height`` [m] over their foot, as the probe is over its own."""
+    return [
+        np.array([wish["position_m"][0], wish.get("lift_m", 0.0) + height, wish["position_m"][1]])
+        for wish in wishes.get("object", [])
+    ]
+
+
+def at_probe(rgb: np.ndarray, attributes: dict[str, Any], room: Room | None) -> np.ndarray:
+    """A map (H, W, 3) as the probe saw it, from one that was brought elsewhere: see `places` for its ``attributes``."""
+    if room is None or VALID not in attributes or MEASURED not in attributes:
+        return rgb
+    valid, measured = (np.array([float(x) for x in attributes[key].split()]) for key in (VALID, MEASURED))
+    return relocate([rgb], room.depth, valid, measured)[0]
+
+
+def places(valid: np.ndarray, measured: np.ndarray) -> dict[str, str]:
+    """Header of a map: the world positions (3,) at which it holds and at which it was measured, metres."""
+    return {VALID: " ".join(map(repr, valid.tolist())), MEASURED: " ".join(map(repr, measured.tolist()))}
 
 
 def _reason(modelled: bool, because: str, cost: str) -> dict[str, Any]:

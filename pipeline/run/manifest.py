@@ -114,6 +114,14 @@ class ProxyFacts(Strict):
         return self
 
 
+class RoomFacts(Strict):
+    """The walls around probe and objects, roughly a box, world frame: takes the light from probe to objects."""
+
+    centre_m: tuple[Coordinate, Coordinate, Coordinate] = Field(description="of the box")
+    size_m: tuple[Length, Length, Length] = Field(description="along its x, y, z")
+    yaw_deg: float = Field(0.0, description="about +Y, counter-clockwise seen from above")
+
+
 class OccluderFacts(Strict):
     """A real thing in front of the objects: a mesh file in the world frame, or a mask picture of the plate."""
 
@@ -180,6 +188,7 @@ class CaptureFacts(Strict):
     pose: list[PoseFacts] = Field([])
     exposure: list[ExposureFacts] = Field([])
     proxy: list[ProxyFacts] = Field([])
+    room: RoomFacts | None = None
     occluder: list[OccluderFacts] = Field([])
     reference: list[ReferenceFacts] = Field([])
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
@@ -200,9 +209,10 @@ class CaptureFacts(Strict):
         twice = sorted({pose.view for pose in self.pose if [other.view for other in self.pose].count(pose.view) > 1})
         if twice:
             raise ValueError(f"pose.view {twice} has several [[pose]] tables; expected one per view")
-        strange = sorted({seen.view for one in self.reference for seen in one.seen} - views)
+        shown = views | {lens.name for lens in getattr(self.probe, "fisheye", []) if lens.files}
+        strange = sorted({seen.view for one in self.reference for seen in one.seen} - shown)
         if strange:
-            raise ValueError(f"reference.seen.view is {strange}; expected one of {sorted(views)}")
+            raise ValueError(f"reference.seen.view is {strange}; expected one of {sorted(shown)}")
         for kind, tables in (("proxy", self.proxy), ("occluder", self.occluder), ("reference", self.reference)):
             given = [table.name for table in tables]
             if len(set(given)) < len(given):
