@@ -1,4 +1,4 @@
-"""Probes that are no mirror ball, on closed forms: round trip, six directions, constant worlds, energy, exposure."""
+"""A ready-made map as the probe, and what all kinds share: facts, scale, a capture without balls."""
 
 from __future__ import annotations
 
@@ -7,113 +7,21 @@ from typing import Any
 import numpy as np
 import pytest
 from command import DESK, command
-from mirror_scene import Place, look_at, photograph
+from lit_room import CAMERA, EYE, GRID, lamp_map, mapped, raster, room_light, room_plate, seen, shots, stage_on
 
-from pipeline.camera.lens import project
-from pipeline.camera.rigid import rotation_exp, rotation_log
 from pipeline.conventions import (
     direction_from_latlong,
-    latlong_directions,
-    latlong_from_direction,
-    latlong_solid_angles,
 )
 from pipeline.image.colour import convert
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
-from pipeline.probes import combine, fisheye, map_scale, orientation
+from pipeline.probes import map_scale
 from pipeline.probes.kinds import KINDS
-from pipeline.probes.observation import Grid, Observation, Shots
+from pipeline.probes.observation import Grid
 from pipeline.probes.ready_made import rotation_of
 from pipeline.run import formats
 from pipeline.run.errors import ArtifactError, CaptureError
 from pipeline.run.manifest import BALL_KINDS, PROBE_KINDS, CaptureFacts, load_capture
-from pipeline.types import Camera, Raster, View
-from stages import knobs, probe
-
-GRID = Grid(64)
-BOARD = {"dictionary": "DICT_5X5_100", "squares": [7, 5], "square_m": 0.03, "marker_m": 0.022, "legacy": False}
-EYE = np.array([0.0, 0.12, 0.0])  # where the light is measured in the synthetic place
-
-
-def wallpaper(height: int = 512, patches: int = 900) -> np.ndarray:
-    """RGB (H, 2H, 3) of a far room: hard-edged patches of every size and colour, so that pictures have features."""
-    rng = np.random.default_rng(0)
-    rgb = np.ones((height, 2 * height, 3))
-    for row, column, tall, wide in rng.integers((0, 0, 3, 3), (height, 2 * height, 60, 90), (patches, 4)):
-        rgb[row : row + tall, column : column + wide] *= rng.uniform(0.5, 1.7, 3)
-    return np.clip(rgb, 0.1, 6.0)
-
-
-WALLPAPER = wallpaper()
-
-
-def room(w: np.ndarray) -> np.ndarray:
-    """RGB (N, 3) of the wallpaper in directions (N, 3): texels of constant radiance."""
-    u, v = latlong_from_direction(w)
-    height, width = WALLPAPER.shape[:2]
-    return WALLPAPER[np.minimum((v * height).astype(int), height - 1), (u * width).astype(int) % width]
-
-
-ROOM = Place(room, plane=True, ball=None)
-CAMERA = Camera(width=300, height=225, fx=190, fy=190, cx=151, cy=110, distortion=np.array([-0.05, 0.01, 0, 0, 0]))
-POSE = look_at((0.3, 0.45, 0.7), (0.1, 0.4, 0.0))
-
-
-def raster(picture: np.ndarray) -> Raster:
-    channels = {**Raster.split(np.float32(picture)), **Raster.split(np.float32(1e-6 + 0 * picture), "variance")}
-    return Raster(channels | {"mask": np.zeros(picture.shape[:2], np.uint32)}, "acescg")
-
-
-@pytest.fixture(scope="module")
-def plate() -> Raster:
-    return raster(photograph(ROOM, CAMERA, POSE, 3))
-
-
-def latlong_of(place: Place, eye: np.ndarray, height: int, split: int = 2) -> np.ndarray:
-    w = latlong_directions(height * split, 2 * height * split).reshape(-1, 3)
-    rgb = place.radiance(np.broadcast_to(eye, w.shape), w)
-    return resize_environment(rgb.reshape(height * split, 2 * height * split, 3), height, 2 * height)
-
-
-@pytest.fixture(scope="module")
-def truth() -> np.ndarray:
-    return latlong_of(ROOM, EYE, 128)
-
-
-def facts(kind: str, board: bool = False, **stated: Any) -> dict[str, Any]:
-    """Facts of a kind as ingest writes them, defaults and all."""
-    model = PROBE_KINDS[kind].model_validate({"kind": kind, **stated.pop("facts", {}), **stated})
-    return {"probe": model.model_dump(mode="json"), "ball": [], "board": BOARD if board else None}
-
-
-def shots(of: dict[str, Any], plate: Raster | None = None, **photographs: Raster) -> Shots:
-    empty = raster(np.ones((CAMERA.height, CAMERA.width, 3)))
-    view = View(world_from_camera=POSE, covariance=np.eye(6) * 1e-8, route="given", rms_px=0.1, points=20)
-    return Shots(
-        of, {"plate": plate or empty, **photographs}, CAMERA, {"plate": view, **dict.fromkeys(photographs, view)}
-    )
-
-
-def mapped(folder, rgb: np.ndarray, stored: str = "acescg", kind: str = "map", **stated: Any) -> dict[str, Any]:
-    """Facts of a map that was written to a folder."""
-    path = folder / "light.exr"
-    formats.write_exr(path, Raster(Raster.split(np.float32(rgb)), stored))
-    found = facts(kind, stated.pop("board", False), facts={"file": path.name} | stated)
-    found["probe"]["path"] = str(path)
-    return found
-
-
-def seen(folder, rgb: np.ndarray, plate: Raster | None = None, grid: Grid = GRID, **stated: Any) -> Observation:
-    """What the kind ``map`` makes of a picture."""
-    return KINDS["map"].observe(shots(mapped(folder, rgb, **stated), plate), grid)
-
-
-def lamp_map(direction: np.ndarray, height: int = 64) -> np.ndarray:
-    """A dark world with one bright texel where ``direction`` points."""
-    w = latlong_directions(height, 2 * height)
-    rgb = np.full((height, 2 * height, 3), 1e-6)
-    rgb[np.unravel_index((w @ direction).argmax(), w.shape[:2])] = 1e4
-    return rgb
-
+from pipeline.types import Raster
 
 # ---- a ready-made map ------------------------------------------------------------------------------------------------
 
@@ -123,8 +31,8 @@ def test_every_kind_has_facts_and_a_class():
     assert set(BALL_KINDS) < set(KINDS)
 
 
-def test_map_comes_back_as_it_was(tmp_path, truth):
-    small = np.float32(resize_environment(truth, 32, 64))
+def test_map_comes_back_as_it_was(tmp_path):
+    small = np.float32(resize_environment(room_light(), 32, 64))
     found = seen(tmp_path, small, scale=1.0).maps["map"]
     assert np.array_equal(np.float32(found.rgb), small)
     assert found.coverage.min() == 1
@@ -250,9 +158,9 @@ def test_plateau_is_pointed_at_and_the_stated_limit_marks_it(tmp_path):
 # ---- its scale -------------------------------------------------------------------------------------------------------
 
 
-def test_scale_from_what_plate_and_map_both_see(tmp_path, plate, truth):
+def test_scale_from_what_plate_and_map_both_see(tmp_path):
     for factor in (1.0, 0.5):  # the plate in another unit than the map
-        found = seen(tmp_path, truth * factor, plate, Grid(256), position_m=EYE.tolist())
+        found = seen(tmp_path, room_light() * factor, room_plate(), Grid(256), position_m=EYE.tolist())
         scale = found.numbers["scale"]
         assert scale["route"] == "plate"
         # three standard deviations of what it says itself: 1 % and the spread over the cells
@@ -260,24 +168,24 @@ def test_scale_from_what_plate_and_map_both_see(tmp_path, plate, truth):
         assert scale["sigma_rel_shared"] < 0.03
 
 
-def test_another_white_balance_is_taken_off(tmp_path, plate, truth):
+def test_another_white_balance_is_taken_off(tmp_path):
     gains = np.array([1.3, 1.0, 0.7])
-    found = seen(tmp_path, truth * gains, plate, Grid(256), position_m=EYE.tolist())
+    found = seen(tmp_path, room_light() * gains, room_plate(), Grid(256), position_m=EYE.tolist())
     assert np.array(found.numbers["scale"]["factor"]) * gains == pytest.approx(1, rel=0.03)
     assert any("colours differ" in text for text in found.warnings)
 
 
-def test_map_of_another_place_is_not_levelled_by_what_it_does_not_see(tmp_path, plate):
+def test_map_of_another_place_is_not_levelled_by_what_it_does_not_see(tmp_path):
     strange = np.random.default_rng(1).lognormal(0, 1.2, (64, 128, 3))
-    found = seen(tmp_path, strange, plate, Grid(256), position_m=EYE.tolist())
+    found = seen(tmp_path, strange, room_plate(), Grid(256), position_m=EYE.tolist())
     assert found.numbers["scale"]["route"] == "unknown"
     assert any("do not see the same things" in text for text in found.warnings)
     assert any("NOTHING SAYS HOW BRIGHT" in text for text in found.warnings)
     assert found.numbers["scale"]["sigma_rel_shared"] == 1
 
 
-def test_stated_scale_is_believed_and_the_plate_may_object(tmp_path, plate, truth):
-    found = seen(tmp_path, truth, plate, Grid(256), position_m=EYE.tolist(), scale=2.0)
+def test_stated_scale_is_believed_and_the_plate_may_object(tmp_path):
+    found = seen(tmp_path, room_light(), room_plate(), Grid(256), position_m=EYE.tolist(), scale=2.0)
     assert found.numbers["scale"]["factor"] == [2, 2, 2]
     assert any("but the plate says" in text for text in found.warnings)
 
@@ -296,226 +204,13 @@ def test_scale_from_a_surface_of_known_albedo(tmp_path, route):
     assert scale["sigma_rel_shared"] == pytest.approx(0.09 if route == "paper" else 0.1)
 
 
-def test_shared_error_of_the_scale_is_told_apart_from_that_of_texels(tmp_path, plate):
+def test_shared_error_of_the_scale_is_told_apart_from_that_of_texels(tmp_path):
     stated = mapped(tmp_path, np.full((32, 64, 3), 2.0), scale=1.0, scale_sigma_rel=0.2, sigma_rel=0.0)
     found = KINDS["map"].observe(shots(stated), GRID)
     assert found.scale_sigma == 0.2
     assert np.sqrt(found.maps["map"].variance.max()) < 0.01  # the file's eight bits
-    variance = stage_on(stated, plate)[1].outputs["environment"].rgb("variance")
+    variance = stage_on(stated, room_plate())[1].outputs["environment"].rgb("variance")
     assert np.sqrt(variance[:28]) == pytest.approx(0.4, rel=1e-3)  # above the plane that the plate lays
-
-
-# ---- a panorama ------------------------------------------------------------------------------------------------------
-
-
-def panorama(rotation: np.ndarray, height: int = 256, noise: float = 0.01, seed: int = 0) -> np.ndarray:
-    """The room from EYE as a camera turned by ``rotation`` (world_from_map) stitches it, in another unit, noisy."""
-    w = latlong_directions(2 * height, 4 * height).reshape(-1, 3) @ rotation.T
-    rgb = ROOM.radiance(np.broadcast_to(EYE, w.shape), w).reshape(2 * height, 4 * height, 3)
-    rgb = resize_environment(rgb, height, 2 * height)
-    return 0.4 * rgb * (1 + noise * np.random.default_rng(seed).normal(size=rgb.shape))
-
-
-@pytest.mark.parametrize("seed", [0, 3])
-def test_panorama_is_turned_by_what_the_plate_shows(tmp_path, plate, seed):
-    rng = np.random.default_rng(seed)
-    rotation = rotation_of(rng.uniform(-180, 180), np.array([0.05 * rng.normal(), 1.0, 0.03]))
-    found = mapped(tmp_path, panorama(rotation, seed=seed), kind="panorama", position_m=EYE.tolist())
-    numbers = KINDS["panorama"].observe(shots(found, plate), GRID).numbers
-    error = rotation_log(np.array(numbers["orientation"]["world_from_map"]) @ rotation.T)
-    # three standard deviations of what it says; eight other turns and noises had 0.03 to 1.1 as chi2 of three
-    assert np.degrees(np.linalg.norm(error)) < 3 * np.sqrt(3) * numbers["orientation"]["sigma_deg"]
-    assert numbers["orientation"]["sigma_deg"] < 0.15
-    assert numbers["scale"]["route"] == "plate"
-    assert numbers["scale"]["factor"][1] == pytest.approx(2.5, rel=3 * numbers["scale"]["sigma_rel_shared"])
-
-
-def test_panorama_without_anything_in_common_asks_for_a_click(tmp_path, plate):
-    strange = np.random.default_rng(0).gamma(1, 1, (64, 128, 3))
-    with pytest.raises(CaptureError, match=r"click one lamp or corner in both|needed 8"):
-        KINDS["panorama"].observe(shots(mapped(tmp_path, strange, kind="panorama"), plate), GRID)
-
-
-def test_tones_turn_a_panorama_that_is_too_blurred_for_features(tmp_path, plate):
-    for yaw in (-70.0, 151.0):
-        blurred = resize_environment(panorama(rotation_of(yaw, AXES[2])), 32, 64)
-        found = mapped(tmp_path, blurred, kind="panorama", position_m=EYE.tolist())
-        told = KINDS["panorama"].observe(shots(found, plate), GRID).numbers["orientation"]
-        assert told["route"] == "tones"
-        error = rotation_log(np.array(told["world_from_map"]) @ rotation_of(yaw, AXES[2]).T)
-        assert np.degrees(np.linalg.norm(error)) < 3 * told["sigma_deg"]  # half a texel of 2.8 degrees, and up
-
-
-def test_a_clicked_lamp_and_up_turn_the_panorama(tmp_path):
-    rotation = rotation_of(-140.0, np.array([0.0, 1.0, 0.0]))
-    lamp = np.array([0.5, 0.6, -0.4]) / np.linalg.norm([0.5, 0.6, -0.4])
-    u, v = latlong_from_direction(rotation.T @ lamp)
-    px = [float(u * 128), float(v * 64)]
-    on_plate = project(CAMERA, (POSE[:3, :3].T @ np.array([0.05, 0.1, -1.0]))[None])[0]
-    u, v = latlong_from_direction(rotation.T @ np.array([0.05, 0.1, -1.0]))
-    for point in ({"px": px, "direction": (3 * lamp).tolist()}, {"px": px, "world_m": (EYE + 2 * lamp).tolist()},
-                  {"px": [float(u * 128), float(v * 64)], "plate_px": on_plate.tolist()}):  # fmt: skip
-        found = mapped(tmp_path, np.ones((64, 128, 3)), kind="panorama", position_m=EYE.tolist(), point=[point])
-        told = KINDS["panorama"].observe(shots(found), GRID).numbers["orientation"]
-        assert np.array(told["world_from_map"]) == pytest.approx(rotation, abs=1e-6)
-        assert told["sigma_deg"] > 3  # three pixels of 2.8 degrees
-
-
-def test_clicks_that_contradict_each_other_raise_the_uncertainty():
-    up, sigma = np.array([0.0, 1, 0]), np.full(2, 0.01)
-    one = AXES[[0, 4]]
-    good = orientation.from_points(one, one, sigma, up, 0.01)
-    off = orientation.from_points(one, one @ rotation_exp(np.array([0, 0.3, 0])) * [[1], [0]] + one * [[0], [1]],
-                                  sigma, up, 0.01)  # fmt: skip
-    assert off.sigma_rad > 5 * good.sigma_rad
-
-
-def test_spots_on_the_plane_turn_a_picture_that_was_taken_elsewhere():
-    """Directions of the same spots of the plane from two places: only their second reading agrees."""
-    rng = np.random.default_rng(0)
-    spots = np.stack([rng.uniform(-0.5, 0.5, 60), np.zeros(60), rng.uniform(-0.5, 0.5, 60)], -1)
-    eye, centre, rotation = POSE[:3, 3], EYE, rotation_of(50.0, np.array([0.1, 1.0, 0.0]))
-
-    def directions(origin: np.ndarray) -> np.ndarray:
-        return (spots - origin) / np.linalg.norm(spots - origin, axis=1, keepdims=True)
-
-    local = directions(centre) @ rotation
-    local[40:] = rng.permutation(local[40:])  # a third is wrong
-    found = orientation.robust(local, directions(eye), directions(centre), np.arange(60))
-    assert np.linalg.norm(rotation_log(found.rotation @ rotation.T)) < 1e-9
-    assert found.numbers["on_plane"] >= 40
-    wrong = orientation.robust(local, directions(eye), np.full((60, 3), np.nan), np.arange(60))
-    assert wrong is None or wrong.numbers["agree"] < 40
-
-
-def test_wahba_is_as_sure_as_it_says():
-    # 300 trials: the mean of chi2 over three degrees of freedom has a standard error of 0.14
-    rng, sigma = np.random.default_rng(1), 0.01
-    world = rng.normal(size=(20, 3)) * [1, 0.3, 1]
-    world /= np.linalg.norm(world, axis=1, keepdims=True)
-    information = np.linalg.inv(orientation.rotation_covariance(world, np.full(20, sigma)))
-    chi2 = []
-    for _ in range(300):
-        seen = world + sigma * rng.normal(size=world.shape)
-        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-        error = rotation_log(orientation.wahba(seen, world, np.ones(20)))
-        chi2.append(error @ information @ error)
-    assert np.mean(chi2) == pytest.approx(3, abs=0.5)
-
-
-def test_nadir_is_not_believed_and_the_plane_is_laid_there(tmp_path, plate):
-    tripod = panorama(np.eye(3), noise=0)
-    tripod[latlong_directions(*tripod.shape[:2])[..., 1] < -np.cos(np.radians(14))] = 1e3
-    told = {"position_m": EYE.tolist(), "yaw_deg": 0.0}
-    found = mapped(tmp_path, tripod, kind="panorama", **told)
-    view = KINDS["panorama"].observe(shots(found, plate), GRID).maps["panorama"]
-    assert (view.coverage[-2:] == 0).all()
-    assert view.coverage[:28].min() == 1
-    light, _ = stage_on(found, plate)
-    assert light.max() < 2 * WALLPAPER.max()
-    believed = found | {"probe": found["probe"] | {"nadir_deg": 0.0}}
-    assert KINDS["panorama"].observe(shots(believed, plate), GRID).maps["panorama"].rgb.max() > 100
-
-
-# ---- fisheye photographs ---------------------------------------------------------------------------------------------
-
-LENS = {"fov_deg": 200.0, "radius_px": 90.0, "centre_px": (92.0, 91.0)}  # a pixel is 1.1 degrees
-FINE = {"fov_deg": 200.0, "radius_px": 150.0, "centre_px": (152.0, 151.0)}
-
-
-def fisheye_picture(lens: dict[str, Any], rotation: np.ndarray, light) -> np.ndarray:
-    """(size, size, 3) by the inverse of the projection, 3 x 3 rays a pixel; black outside the image circle."""
-    size = int(2 * lens["centre_px"][0])
-    steps = (np.arange(3 * size) + 0.5) / 3
-    y, x = np.meshgrid(steps - lens["centre_px"][1], steps - lens["centre_px"][0], indexing="ij")
-    half, r = np.radians(lens["fov_deg"]) / 2, np.hypot(x, y) / lens["radius_px"]
-    theta = {
-        "equidistant": r * half, "equisolid": 2 * np.arcsin(np.minimum(r * np.sin(half / 2), 1)),
-        "stereographic": 2 * np.arctan(r * np.tan(half / 2)),
-    }[lens["projection"]]  # fmt: skip
-    phi = np.arctan2(y, x)
-    ray = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
-    rgb = light(ray @ rotation.T) * (r.ravel() < 1)[:, None]
-    return rgb.reshape(size, 3, size, 3, 3).mean((1, 3))
-
-
-def pair(
-    folder, light, gains=(1.0, 1.0), turns=((30.0, 0.0, 0.0), (-150.0, 4.0, 10.0)), **stated: Any
-) -> dict[str, Any]:
-    """Facts of two fisheye pictures, written to a folder; ``turns``: their yaw, pitch, roll in degrees."""
-    projection, optics = stated.pop("projection", "equidistant"), stated.pop("optics", LENS)
-    lenses = []
-    for number, (yaw, pitch, roll) in enumerate(turns):
-        lens = optics | {"name": f"eye_{number}", "file": f"{number}.exr", "projection": projection}
-        held = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
-        picture = gains[number] * fisheye_picture(lens, fisheye.rotation_of(held), light)
-        formats.write_exr(folder / lens["file"], Raster(Raster.split(np.float32(picture)), "acescg"))
-        lenses.append(lens | (held if number not in stated.get("hidden", ()) else {}))
-    stated.pop("hidden", None)
-    found = facts("fisheye_pair", fisheye=lenses, position_m=EYE.tolist(), **stated)
-    for lens in found["probe"]["fisheye"]:
-        lens["path"] = str(folder / lens["file"])
-    return found
-
-
-def around(w: np.ndarray) -> np.ndarray:
-    """The place as seen from EYE in directions (N, 3)."""
-    return ROOM.radiance(np.broadcast_to(EYE, w.shape), w)
-
-
-@pytest.mark.parametrize("projection", ["equidistant", "equisolid", "stereographic"])
-def test_two_fisheyes_make_the_whole_sphere(tmp_path, projection):
-    def smooth(w: np.ndarray) -> np.ndarray:
-        return 1 + 0.4 * w + 0.2 * w[:, :1] * w[:, 1:2]
-
-    found = KINDS["fisheye_pair"].observe(shots(pair(tmp_path, smooth, projection=projection, scale=1.0)), GRID)
-    merged = combine.merge(list(found.maps.values()))
-    assert merged.seen.min() > 0.95  # texels cut by the rim of one photograph
-    w = latlong_directions(32, 64)
-    # 1 %: a texel of 5.6 degrees differs from its centre by 0.1 %
-    assert merged.rgb == pytest.approx(smooth(w.reshape(-1, 3)).reshape(w.shape), rel=0.01)
-    assert found.numbers["seams"]["overlap_sr"] == pytest.approx(4 * np.pi * np.sin(np.radians(10)), rel=0.1)
-    assert found.numbers["seams"]["disagreement_median_rel"]["0-1"] < 2e-3
-
-
-@pytest.mark.parametrize("axis", range(6))
-def test_fisheye_shows_a_lamp_where_it_is(tmp_path, axis):
-    def lamp(w: np.ndarray) -> np.ndarray:
-        return np.where((w @ AXES[axis] > np.cos(0.06))[:, None], 100.0, 0.01) * np.ones(3)
-
-    found = KINDS["fisheye_pair"].observe(shots(pair(tmp_path, lamp, scale=1.0)), Grid(128))
-    merged = combine.merge(list(found.maps.values())).rgb
-    seen_at = (latlong_directions(64, 128) * (merged[..., :1] - 0.01) * latlong_solid_angles(64, 128)[..., None]).sum(
-        (0, 1)
-    )
-    assert np.degrees(np.arccos(seen_at @ AXES[axis] / np.linalg.norm(seen_at))) < 0.5  # half a pixel
-    true = 100 * 2 * np.pi * (1 - np.cos(0.06)) + 0.01 * 4 * np.pi
-    # 3 %: 3 x 3 rays a pixel cut the rim of a lamp of 6 pixels across
-    assert total_energy(merged)[1] == pytest.approx(true, rel=0.03)
-
-
-def test_fisheyes_of_unequal_exposure_and_unknown_rotation(tmp_path, plate):
-    """The first is turned by the plate's features, the second by those of the overlap; exposures are made equal."""
-    turns = ((190.0, 0.0, 0.0), (10.0, 0.0, 0.0))  # the first looks where the plate does
-    given = pair(tmp_path, around, (0.5, 0.8), turns, hidden=(0, 1), optics=FINE)
-    found = KINDS["fisheye_pair"].observe(shots(given, plate), GRID)
-    for number, route in enumerate(("features", "overlap")):
-        told = found.numbers[f"eye_{number}"]
-        held = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turns[number], strict=True))
-        error = rotation_log(np.array(told["world_from_camera"]) @ fisheye.rotation_of(held).T)
-        assert told["route"] == route
-        assert np.degrees(np.linalg.norm(error)) < 3 * np.sqrt(3) * told["sigma_deg"]
-    assert found.numbers["seams"]["exposure_over_first"][1] == pytest.approx(1.6, rel=0.05)
-    scale = found.numbers["scale"]
-    assert scale["factor"][1] == pytest.approx(2.0, rel=3 * scale["sigma_rel_shared"])
-
-
-def test_stage_takes_a_fisheye_pair(tmp_path, plate, truth):
-    found, result = stage_on(pair(tmp_path, around), plate)
-    expected = resize_environment(truth, 64, 128)
-    # 4 %: 3 sigma of the scale's 1 %, and pixels of 1.1 degrees
-    assert irradiance(found, AXES) == pytest.approx(irradiance(expected, AXES), rel=0.04)
-    assert result.numbers["seen_fraction"] > 0.99
 
 
 # ---- the manifest ----------------------------------------------------------------------------------------------------
@@ -550,16 +245,9 @@ def test_probe_without_a_kind_is_a_mirror_ball():
 # ---- from photographs to the light -----------------------------------------------------------------------------------
 
 
-def stage_on(of: dict[str, Any], plate: Raster, **photographs: Raster) -> tuple[np.ndarray, Any]:
-    """The whole stage on arrays: the environment's radiance (H, W, 3), and its result."""
-    given = shots(of, plate, **photographs)
-    result = probe.compute(of, given.photographs, given.camera, given.views, {}, knobs.Probe(width=128, supersample=2))
-    return result.outputs["environment"].rgb(), result
-
-
-def test_stage_takes_a_map(tmp_path, plate, truth):
-    found, result = stage_on(mapped(tmp_path, truth, position_m=EYE.tolist()), plate)
-    expected = resize_environment(truth, 64, 128)
+def test_stage_takes_a_map(tmp_path):
+    found, result = stage_on(mapped(tmp_path, room_light(), position_m=EYE.tolist()), room_plate())
+    expected = resize_environment(room_light(), 64, 128)
     # 3 %: the scale is good to 1 %, the plane is laid from pixels of 0.3 degrees
     assert irradiance(found, AXES) == pytest.approx(irradiance(expected, AXES), rel=0.03)
     assert result.outputs["balls"] == {}

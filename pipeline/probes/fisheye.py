@@ -24,6 +24,7 @@ from pipeline.run.errors import CaptureError
 from pipeline.run.formats import read_linear
 
 FADE = np.radians(10.0)  # over which a photograph's weight falls to nothing at its rim
+CUT_PX = 1.5  # at the rim of the image circle, where pixels are partly outside
 REGISTERED = 512, 1024  # texels of the maps on which features are looked for
 UPRIGHT = np.diag([-1.0, -1.0, 1.0])  # a camera that looks along +Z of the world: x to its right, y down
 
@@ -83,7 +84,7 @@ def to_pixel_of(lens: dict[str, Any], shape: tuple[int, int]) -> ToPixel:
         safe = np.where(across > 1e-12, across, 1.0)
         x, y = x0 + r * w[..., 0] / safe, y0 + r * w[..., 1] / safe
         inside = (x >= 0.5) & (x <= shape[1] - 0.5) & (y >= 0.5) & (y <= shape[0] - 0.5)
-        return x, y, inside & (theta <= half)
+        return x, y, inside & (r <= lens["radius_px"] - CUT_PX)
 
     return to_pixel
 
