@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.light.sampling import bilinear, planes
-from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, ball_points
+from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, ball_points, pixel_step
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.reflection import rays_from_directions
 
@@ -47,7 +47,7 @@ def shared_spots(one: Sight, other: Sight, surface: Surface, rim: float) -> tupl
 
     Also how many pixels could be tested. The ball must not have been moved between the two.
     """
-    px = ball_pixels(one)
+    px = ball_pixels(one, pixel_step(one))
     normal, sine, away, _ = ball_points(one, px + 0.5)
     keep = (sine < rim) & (away[:, 1] > HORIZON)
     px, normal, sine, away = px[keep], normal[keep], sine[keep], away[keep]

@@ -8,21 +8,23 @@ from typing import Any
 import numpy as np
 
 from pipeline.image.colour import Space, convert
-from pipeline.probes import ball_dirt
+from pipeline.probes import ball_dirt, ball_shape
 from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, neighbourhood, pixel_step, plane_pairs
+from pipeline.probes.ball_shape import Dents
 from pipeline.probes.ball_surface import Measured, Surface, decide, measure, plane_blocks
 from pipeline.probes.finding import Found
-from pipeline.probes.observation import Shots
+from pipeline.probes.observation import Shots, ViewMap
 from pipeline.transport.conductors import preset
 from pipeline.types import Raster
 
 
 @dataclass(frozen=True)
 class BallEvidence:
-    """The surface that is used, the dirty pixels (H, W) of the views that have some, and what was measured."""
+    """The surface that is used, dirty pixels (H, W) and dents of the views that show some, and what was measured."""
 
     surface: Surface
     dirty: dict[str, np.ndarray] = field(default_factory=dict)
+    dents: dict[str, Dents] = field(default_factory=dict)
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
@@ -44,10 +46,98 @@ def examine(shots: Shots, found: dict[str, Found], radius: float, rim: float) ->
     measured = measure(list(pairs.values()), tint)
     surface, warnings = decide(given, material, measured)
     shapes = {name: shots.photographs[name].shape for name in found}
+    dented = {}
+    for name, sight in sights.items():
+        shifts = ball_shape.patch_shifts(plane_pairs(sight, rim, every=True))
+        size = found[name].fit.radius_px / sight.binned
+        if (one := ball_shape.dents(sight, size, found[name].fit.covariance, shifts)) is not None:
+            dented[name] = one
     dirty, spots, tested = find_dirt(sights, pairs, measured, surface, rim, shapes, warnings)
     numbers = {"reflectance": surface_numbers(surface, given, measured), "dirt": spots}
     reasons = [*surface_reasons(surface, measured), dirt_reason(dirty, tested, measured)]
-    return BallEvidence(surface, dirty, numbers, warnings, reasons)
+    return BallEvidence(surface, dirty, dented, numbers, warnings, reasons)
+
+
+@dataclass(frozen=True)
+class Shaped:
+    """The maps with the directions' uncertainty that the ball's shape adds; whether only their harmonics are good."""
+
+    maps: dict[str, ViewMap]
+    smooth_only: bool
+    numbers: dict[str, Any]
+    warnings: list[str]
+    evidence: list[dict[str, Any]]
+
+
+def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_m: float | None, radius: float) -> Shaped:
+    """What dents, and glass of this thickness [m] before the mirror, do to the maps of the views.
+
+    Dents are one ball's, so the view that shows most of them speaks for all; two views that agree better than that
+    refute it. Directions that are off by more than `ball_shape.TOO_DENTED` leave nine harmonics and no more.
+    """
+    numbers: dict[str, Any] = {name: dent_numbers(one) for name, one in dented.items()}
+    names, warnings = list(maps), []
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+    bounds = {f"{a}, {b}": ball_shape.second_view_sigma(maps[a], maps[b]) for a, b in pairs}
+    seen = [value for value in bounds.values() if np.isfinite(value)]
+    sigma = max((one.direction_sigma_rad for one in dented.values()), default=0.0)
+    sigma = min([sigma, *seen])
+    numbers["second_view_direction_deg"] = {name: float(np.degrees(value)) for name, value in bounds.items()}
+    evidence = [dent_reason(dented, sigma, seen)]
+    glass = 0.0
+    if glass_m is not None:
+        sine = np.sqrt((np.arange(200) + 0.5) / 200) * 0.97
+        ways = ball_shape.glass_displacement(sine, min(glass_m / radius, 0.5))
+        glass = float(np.sqrt((ways**2).mean()))
+        numbers["glass_displacement_deg"] = {"rms": float(np.degrees(glass)), "rim": float(np.degrees(ways[-1]))}
+        warnings.append(
+            f"probe.glass_mm: the silvered back mirrors directions {np.degrees(glass):.2f} degrees rms from where the "
+            "front would, more towards the rim, and the glass itself mirrors 4 %, undisplaced; the variance has the "
+            "first, the map neither"
+        )
+    total = float(np.hypot(sigma, glass))
+    numbers["direction_sigma_deg"] = float(np.degrees(total))
+    too_dented = total > ball_shape.TOO_DENTED
+    if sigma > 0:
+        text = f"the ball is dented: mirrored directions are off by {np.degrees(sigma):.1f} degrees rms"
+        warnings.append(
+            f"{text}, more than {np.degrees(ball_shape.TOO_DENTED):.1f}; only nine harmonics of the map are kept: soft "
+            "light is right, mirror images and hard shadows are not"
+            if too_dented
+            else f"{text}; the variance says so"
+        )
+    return Shaped(
+        {name: ball_shape.unsure(view, total) if total > 0 else view for name, view in maps.items()},
+        too_dented, {"shape": numbers}, warnings, evidence,
+    )  # fmt: skip
+
+
+def dent_numbers(one: Dents) -> dict[str, Any]:
+    """Figures of the plane's picture in one view of the ball."""
+    return {
+        "patches": one.patches, "shift_rms_px": one.rms_px,
+        "direction_rms_deg": float(np.degrees(one.direction_rms_rad)),
+        "floor_deg": float(np.degrees(one.floor_rad)),
+        "centre_shift_mm": (1e3 * one.centre_shift_m).tolist(),
+    }  # fmt: skip
+
+
+def dent_reason(dented: dict[str, Dents], sigma: float, seen: list[float]) -> dict[str, Any]:
+    """Whether dents are modelled, and why."""
+    if not dented:
+        said = "too little texture of the plane is seen in the ball to tell"
+    else:
+        worst = max(dented.values(), key=lambda one: one.direction_rms_rad / one.floor_rad)
+        said = (
+            f"the plane is mirrored {np.degrees(worst.direction_rms_rad):.2f} degrees from where a sphere would, a "
+            f"perfect ball of this fit {np.degrees(worst.floor_rad):.2f}"
+        )
+    if seen:
+        said += f"; two views leave {np.degrees(min(seen)):.1f} degrees to dents and parallax together"
+    return {
+        "term": "dents of the ball", "modelled": sigma > 0, "because": said,
+        "could_cost": "directions off by twice the surface's tilt; the light's energy hardly",
+    }  # fmt: skip
 
 
 def find_dirt(
@@ -66,7 +156,7 @@ def find_dirt(
             compared += tested
         step = pixel_step(one)
         mask = ball_dirt.spot_mask(np.unique(np.concatenate(pixels), axis=0), one.picture.shape[:2], step)
-        share = float(mask.sum() / (np.pi / 4 * len(ball_pixels(one)) * step**2))  # of the disc in its box
+        share = float(mask.sum() / (np.pi / 4 * len(ball_pixels(one, step)) * step**2))  # of the disc in its box
         if share > ball_dirt.MOST:
             warnings.append(
                 f"{name}: {share:.0%} of the ball is darker than predicted, too much for dirt; nothing is masked; is "
@@ -164,7 +254,11 @@ def surface_reasons(surface: Surface, measured: Measured | None) -> list[dict[st
     return [
         {
             "term": "reflectance measured from the plane", "modelled": surface.source == "measured",
-            "because": f"{measured.pairs} pixels of the ball show points of the plane that are seen directly, too",
+            "because": (
+                f"{measured.pairs} pixels of the ball show points of the plane that are seen directly, too: "
+                f"{', '.join(f'{v:.3f} +- {s:.3f}' for v, s in zip(measured.facing, measured.sigma, strict=True))}; "
+                f"used is what is {surface.source}"
+            ),
             "could_cost": "the light is off by what the stated reflectance is off",
         },
         angle,

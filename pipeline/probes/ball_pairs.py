@@ -101,8 +101,8 @@ def neighbourhood(
     )
 
 
-def plane_pairs(sight: Sight, limit: float = 0.97) -> Pairs:
-    """Pairs of one view.
+def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False) -> Pairs:
+    """Pairs of one view; of ``every`` pixel, with fewer rays each, for what needs a picture of them.
 
     Left out: incidence beyond ``limit``, points nearer to or farther from the foot than a few radii, out of the frame,
     hidden by the ball, and whatever touches an invalid or clipped pixel. The way from the ball to the plane is free:
@@ -110,15 +110,16 @@ def plane_pairs(sight: Sight, limit: float = 0.97) -> Pairs:
     """
     picture, camera, world_from_camera = sight.picture, sight.camera, sight.world_from_camera
     centre, radius = sight.centre, sight.radius
-    px = ball_pixels(sight)
-    spread = ((np.arange(SPLIT) + 0.5) / SPLIT - 0.5) * 2  # +- 1 px about the centre
+    px = ball_pixels(sight, 1 if every else pixel_step(sight))
+    split = SPLIT // 2 if every else SPLIT
+    spread = ((np.arange(split) + 0.5) / split - 0.5) * 2  # +- 1 px about the centre
     dx, dy = (part.ravel() for part in np.meshgrid(spread, spread))
     share = (1 - np.abs(dx)) * (1 - np.abs(dy))
     share /= share.sum()
     _, sine, _, point = ball_points(sight, px + 0.5)
     foot = _foot(world_from_camera, centre)
     near = np.linalg.norm((point - foot)[:, ::2], axis=-1) / radius
-    keep = (sine < limit) & (near > NEAREST) & (near < FARTHEST)
+    keep = (sine < limit) & (near > NEAREST) & (near < (4 if every else 1) * FARTHEST)
     px, sine, point = px[keep], sine[keep], point[keep]
     if not len(px):
         return _none()
@@ -160,10 +161,9 @@ def ball_points(sight: Sight, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return normal @ rotation.T, sine, away, start + reach[:, None] * away
 
 
-def ball_pixels(sight: Sight) -> np.ndarray:
-    """Columns and rows (N, 2) of pixels about the ball, `pixel_step` apart."""
+def ball_pixels(sight: Sight, step: int) -> np.ndarray:
+    """Columns and rows (N, 2) of pixels about the ball, ``step`` apart."""
     low, high = _box(sight)
-    step = pixel_step(sight)
     columns, rows = np.arange(low[0], high[0] + 1, step), np.arange(low[1], high[1] + 1, step)
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
 
