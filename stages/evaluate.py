@@ -24,7 +24,7 @@ from pipeline.image import metrics
 from pipeline.image.balance import balanced
 from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
-from pipeline.light import prediction
+from pipeline.light import near_field, prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
 from pipeline.run.artifacts import (
     ALBEDO,
@@ -75,6 +75,7 @@ def compute(
         outputs = {"metrics": {}, "selfcheck": checks, "error_map": nothing}
         return Result(outputs, {"untouched_identical": same, "untouched_fraction": fraction}, warnings)
     truth = load_truth(Path(facts["truth_path"]))
+    light = near_field.at_probe(environment.rgb(), environment.attributes, near_field.room_of(facts))
     found, ref, error_map = score(composite.rgb(), plate, truth, params.pixels_per_degree)
     free = (layers["influence"] == 0) & (layers["obj.A"] == 0)
     found |= {
@@ -83,7 +84,7 @@ def compute(
         "shadow_outside_region": _share(free, ref.shadow),
         "faint_outside_region": _share(free, ref.faint),
         **pose_errors(truth, camera, views, balls),
-        **probe_errors(truth, environment.rgb(), found["scale"]),
+        **probe_errors(truth, light, found["scale"]),
         **albedo_errors(truth, camera, views["plate"], plane, albedo),
         "seconds": {stage: record["seconds"] for stage, record in records.items()},
     }
@@ -202,7 +203,7 @@ def self_check(
     balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster,
 ) -> dict[str, Any]:  # fmt: skip
     """Predictions beside photographs. Every figure is a median relative (or absolute, for ratios) error."""
-    light = environment.rgb()
+    light = near_field.at_probe(environment.rgb(), environment.attributes, near_field.room_of(facts))
     checks: dict[str, Any] = {"ball": {}, "shadow": {}}
     maps = {}
     for name, ball in balls.items():

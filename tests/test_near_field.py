@@ -139,3 +139,22 @@ def test_objects_outside_the_room_are_named(maps):
     assert found.target is None
     assert "outside" in found.warnings[0]
     assert not ROOM.holds(np.array([0, -0.1, 0]))
+
+
+def test_a_moved_map_is_found_again_at_the_probe(maps):
+    moved = near_field.relocate([maps[0]], ROOM.depth, PROBE, OBJECT)[0]
+    header = near_field.places(OBJECT, PROBE)
+    assert axis_errors(near_field.at_probe(moved, header, ROOM), maps[0]).max() < 0.01
+    assert near_field.at_probe(moved, header, None) is moved
+    assert near_field.at_probe(maps[0], near_field.places(PROBE, PROBE), ROOM) is maps[0]
+
+
+def test_room_and_places_come_from_the_manifests():
+    box = {"centre_m": CENTRE.tolist(), "size_m": SIZE.tolist(), "yaw_deg": 25.0}
+    found = near_field.room_of({"room": box})
+    assert found is not None
+    w = latlong_directions(16, 32)
+    assert found.depth(PROBE, w) == pytest.approx(ROOM.depth(PROBE, w))
+    assert near_field.room_of({}) is None
+    wishes = {"object": [{"position_m": [0.1, 0.2], "lift_m": 0.05}]}
+    assert near_field.places_of(wishes, 0.04)[0] == pytest.approx([0.1, 0.09, 0.2])
