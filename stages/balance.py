@@ -6,8 +6,9 @@ references are joined (pipeline/image/balance.py). Gains are applied where they 
 improbable as three standard deviations); the stages that read the ball's photographs multiply by them. All gains and
 their inverses are written as an ASC CDL collection, and one more that would make the plate's grey neutral, not applied.
 
-Limits: a reference must be lit alike in plate and view; a grey ball shows another side to a camera that moved, so it
-counts from the plate's place only. Without a common reference the gains are 1 with a stated uncertainty.
+Limits: a reference must be lit alike in plate and view, so out of the probe's shadow and glow; a grey ball shows
+another side to a camera that moved, so it counts from the plate's place only. Without a common reference the gains are
+1 with a stated uncertainty.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def compute(
     for view in (name for name in photographs if name != "plate"):
         still = bool(balls.get(view, {}).get("tripod"))
         pairs = [pair for one in references if (pair := pair_of(one, view, photographs, still, warnings))]
-        own = bool(balls.get(view, {}).get("camera")) or model_of(brackets, view) != model_of(brackets, "plate")
+        own = view not in balls or bool(balls[view].get("camera"))  # what is no ball was taken through another lens
+        own |= model_of(brackets, view) != model_of(brackets, "plate")
         if pairs:
             balances[view], numbers[view] = measured(view, pairs, warnings)
         else:

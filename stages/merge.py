@@ -46,6 +46,7 @@ def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.M
     balls = facts.get("ball", [])
     still = {ball["name"] for ball in balls if ball.get("tripod")}
     own = {ball["name"]: json.dumps(ball["camera"], sort_keys=True) for ball in balls if ball.get("camera")}
+    own |= {lens["name"]: "fisheye" for lens in facts.get("probe", {}).get("fisheye", [])}
     return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params, still, own)
 
 

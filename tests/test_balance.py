@@ -137,6 +137,21 @@ def test_three_references_outvote_one_that_is_lit_otherwise():
     assert found.covariance[0, 0] > alone.covariance[0, 0]  # raised, not averaged down
 
 
+def test_joined_references_lie_within_what_they_say():
+    """Three references of different covariance, 2000 draws: 90 to 98 % of the 95 % intervals; measured 0.960 to 0.966.
+
+    Huber's weights and a covariance that only ever grows make them a little wide.
+    """
+    rng = np.random.default_rng(2)
+    roots = [s * rng.normal(size=(3, 3)) for s in (0.003, 0.006, 0.01)]
+    inside = []
+    for _ in range(2000):
+        drawn = [estimate.Gains(TRUE + root @ rng.normal(size=3), root @ root.T, 50) for root in roots]
+        found, _ = estimate.joined(drawn)
+        inside.append(np.abs(found.log - TRUE) < 1.96 * np.sqrt(np.diag(found.covariance)))
+    assert ((np.mean(inside, 0) >= 0.90) & (np.mean(inside, 0) <= 0.98)).all(), np.mean(inside, 0)
+
+
 # ---- a chart ---------------------------------------------------------------------------------------------------------
 
 

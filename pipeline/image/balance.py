@@ -114,7 +114,7 @@ def cells_of(photograph: Raster, outline: np.ndarray, kind: str, across: int) ->
     inside_outline = _inside(px, outline)
     if kind == "grey_ball" and len(outline) == 4:
         inside_outline &= np.hypot(*(uv - 0.5).T) < 0.4  # the corners are of the square around it
-    rgb = photograph.rgb()[rows, columns].reshape(-1, 3).astype(float)
+    rgb = np.stack([photograph[c][rows, columns] for c in "RGB"], -1).reshape(-1, 3).astype(float)
     good = np.isfinite(rgb).all(-1) & (photograph["mask"][rows, columns].ravel() & CLIPPED == 0) & inside_outline
     count = np.bincount(number[inside], minlength=len(place))
     bad = np.bincount(number[inside & ~good], minlength=len(place))
@@ -133,10 +133,12 @@ def _on_reference(px: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 def _inside(px: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """Which pixels (N, 2) lie within a convex outline."""
-    edge = np.roll(outline, -1, 0) - outline
-    gap = px[:, None] - outline
-    turn = edge[:, 0] * gap[..., 1] - edge[:, 1] * gap[..., 0]
-    return np.asarray((turn > 0).all(-1) | (turn < 0).all(-1))
+    left, right = np.ones(len(px), bool), np.ones(len(px), bool)
+    for start, end in zip(outline, np.roll(outline, -1, 0), strict=True):  # one by one: a card has many pixels
+        turn = (end[0] - start[0]) * (px[:, 1] - start[1]) - (end[1] - start[1]) * (px[:, 0] - start[0])
+        left &= turn > 0
+        right &= turn < 0
+    return left | right
 
 
 def _grid_cells(uv: np.ndarray, across: int, margin: float = INNER) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
