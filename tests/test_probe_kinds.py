@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,8 @@ from pipeline.light.environment import AXES, irradiance, resize_environment, tot
 from pipeline.probes import map_scale
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid
-from pipeline.probes.ready_made import rotation_of
+from pipeline.probes.ready_made import clean, rotation_of
+from pipeline.probes.resample import turned
 from pipeline.run import formats
 from pipeline.run.errors import ArtifactError, CaptureError
 from pipeline.run.manifest import BALL_KINDS, PROBE_KINDS, CaptureFacts, load_capture
@@ -240,6 +243,28 @@ def test_probe_without_a_kind_is_a_mirror_ball():
     given = {"name": "k", "plate": {"files": ["a"]}, "camera": {"given": {"fx": 1.0}}}
     found = CaptureFacts.model_validate(given | {"ball": [{"name": "b", "files": ["b"]}], "probe": {"diameter_m": 0.1}})
     assert found.probe.kind == "mirror_ball"
+
+
+# ---- maps that others made -------------------------------------------------------------------------------------------
+
+DATA = Path(os.environ.get("INSITU_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
+REAL = sorted(DATA.glob("env_*/*.*"))
+
+
+@pytest.mark.skipif(not REAL, reason="no maps under INSITU_DATA")
+def test_real_maps_are_read_and_keep_their_energy():
+    for path in REAL:
+        light = clean(formats.read_latlong(path), {"path": str(path), "kind": "map"})
+        assert light.valid.all()
+        turn = turned(light.channels(), rotation_of(77.0, np.array([0.1, 1.0, 0.0])), 64, 128, 2)
+        # 3 %: suns of one texel, as above; most maps stay within 0.3 %
+        assert total_energy(turn.values[..., :3]) == pytest.approx(total_energy(light.rgb), rel=0.03)
+
+
+@pytest.mark.skipif(not (DATA / "brackets_memorial/memorial.hdr").is_file(), reason="not under INSITU_DATA")
+def test_a_damaged_file_of_the_field_is_refused():
+    with pytest.raises(ArtifactError, match="cut off or damaged"):
+        formats.read_latlong(DATA / "brackets_memorial/memorial.hdr")
 
 
 # ---- from photographs to the light -----------------------------------------------------------------------------------

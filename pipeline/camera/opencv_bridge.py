@@ -211,35 +211,41 @@ def first_calibration(
     return camera, poses
 
 
-def feature_matches(picture: np.ndarray, others: list[np.ndarray], ratio: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Pixels of the same spots in one picture (H, W) uint8 and in each of the others: (N, 2) and (N, 2) per other.
+@dataclass(frozen=True)
+class Features:
+    """Spots that can be found again: pixels (N, 2) and their descriptions (N, 128)."""
 
-    SIFT (Lowe 2004); a match is kept when its second-best in ``picture`` is farther by 1 / ``ratio``, and when it is
-    the best both ways. Many are wrong: they are to be judged by geometry.
-    """
+    px: np.ndarray
+    described: np.ndarray
+
+
+def features(picture: np.ndarray) -> Features:
+    """SIFT features (Lowe 2004) of a picture (H, W) uint8."""
     import cv2
 
     finder: Any = cv2.SIFT.create(contrastThreshold=0.02, enable_precise_upscale=True)
+    spots, described = finder.detectAndCompute(np.ascontiguousarray(picture), None)
+    if described is None:
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
+    return Features(ours(np.array([spot.pt for spot in spots])), described)
+
+
+def feature_matches(first: Features, second: Features, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) and (N, 2) of the same spots in two pictures.
+
+    A match is kept when the second-best in ``first`` is farther by 1 / ``ratio``, and when it is the best both ways.
+    Many are wrong: they are to be judged by geometry.
+    """
+    import cv2
+
+    if min(len(first.px), len(second.px)) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    spots, ours_found = finder.detectAndCompute(np.ascontiguousarray(picture), None)
-    nothing = np.empty((0, 2)), np.empty((0, 2))
-    matches = []
-    for other in others:
-        there, theirs_found = finder.detectAndCompute(np.ascontiguousarray(other), None)
-        if ours_found is None or theirs_found is None or min(len(spots), len(there)) < 2:
-            matches.append(nothing)
-            continue
-        back = {m.queryIdx: m.trainIdx for m in matcher.match(ours_found, theirs_found)}
-        pairs = [
-            (best.trainIdx, best.queryIdx)
-            for best, second in matcher.knnMatch(theirs_found, ours_found, k=2)
-            if best.distance < ratio * second.distance and back[best.trainIdx] == best.queryIdx
-        ]
-        if not pairs:
-            matches.append(nothing)
-            continue
-        first, other_index = np.array(pairs).T
-        matches.append(
-            (ours(np.array([spots[i].pt for i in first])), ours(np.array([there[i].pt for i in other_index])))
-        )
-    return matches
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(first.described, second.described)}
+    pairs = [
+        (best.trainIdx, best.queryIdx)
+        for best, other in matcher.knnMatch(second.described, first.described, k=2)
+        if best.distance < ratio * other.distance and back[best.trainIdx] == best.queryIdx
+    ]
+    here, there = np.array(pairs, int).reshape(-1, 2).T
+    return first.px[here], second.px[there]

@@ -46,7 +46,8 @@ class FisheyePair:
         levels = levelling.level(list(maps.values()))
         level = [view.scaled(float(np.exp(-log))) for view, log in zip(maps.values(), levels.log, strict=True)]
         merged = combine.merge(level)
-        found = map_scale.solve(shots, merged.rgb, merged.seen, centre, taken_here=True)
+        developed = not any(lens.get("path") for lens in probe["fisheye"])
+        found = map_scale.solve(shots, merged.rgb, merged.seen, centre, True, developed)
         maps = {name: view.scaled(found.factor) for name, view in zip(maps, level, strict=True)}
         numbers: dict[str, Any] = {
             name: turn.numbers | {"route": turn.route, "sigma_deg": float(np.degrees(turn.sigma_rad)),

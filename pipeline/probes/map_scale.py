@@ -49,8 +49,14 @@ class Ratio:
     shared_sr: float
 
 
-def solve(shots: Shots, rgb: np.ndarray, known: np.ndarray, centre: np.ndarray, taken_here: bool) -> Scale:
-    """The scale of a map (H, W, 3), world frame, in its own unit; ``known`` (H, W) in [0, 1]; ``centre`` (3,) of it."""
+def solve(
+    shots: Shots, rgb: np.ndarray, known: np.ndarray, centre: np.ndarray, taken_here: bool, developed: bool = False
+) -> Scale:
+    """The scale of a map (H, W, 3), world frame, in its own unit; ``known`` (H, W) in [0, 1]; ``centre`` (3,) of it.
+
+    ``developed``: it was made of the capture's own photographs, which are in the plate's unit as well as their
+    exposures are known; that uncertainty comes from the stage balance.
+    """
     probe = shots.facts["probe"]
     ratio = plate_ratio(shots, rgb, known, centre) if taken_here else None
     if probe.get("scale"):
@@ -63,6 +69,8 @@ def solve(shots: Shots, rgb: np.ndarray, known: np.ndarray, centre: np.ndarray, 
             f"map: it and the plate differ by a factor that varies by {np.expm1(ratio.spread):.0%} over the directions "
             "that both show: they do not see the same things; the scale is taken from elsewhere. Is position_m right?"
         )
+    if developed:
+        return Scale(np.ones(3), 0.0, _numbers("developed", np.ones(3), 0.0), said, [_reason("developed", 0.0, True)])
     from_plane = _from_surface(shots, rgb, known)
     if from_plane is not None:
         return Scale(from_plane.factor, from_plane.sigma_rel, from_plane.numbers, said + from_plane.warnings,
@@ -213,6 +221,7 @@ def _reason(route: str, sigma: float, modelled: bool) -> dict[str, Any]:
         "plate": "plate and map show the same directions, the plane from the plate's pixels of the same spots",
         "plane_albedo": "probe.plane_albedo states how the plane reflects",
         "paper": f"the board's white paper reflects {PAPER_ALBEDO} +- {PAPER_SIGMA_REL:.0%}",
+        "developed": "its photographs are in the plate's unit as well as the stage balance knows exposures",
         "unknown": "nothing in the capture ties the map to the plate",
     }
     return {

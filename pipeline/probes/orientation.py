@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.camera.lens import pixel_rays
 from pipeline.camera.markers import grey, tone
-from pipeline.camera.opencv_bridge import feature_matches
+from pipeline.camera.opencv_bridge import Features, feature_matches, features
 from pipeline.camera.rigid import nearest_rotation, rotation_exp
 from pipeline.conventions import direction_from_latlong, latlong_from_direction, latlong_solid_angles
 from pipeline.light.environment import resize_environment
@@ -110,9 +110,8 @@ def from_overlap(
     here, there = visible_windows(latlong, shown, focal), visible_windows(other, other_shown, focal)
     local, world = [np.empty((0, 3))], [np.empty((0, 3))]
     for picture in there:
-        for window, (on_other, on_this) in zip(
-            here, feature_matches(picture.coded, [one.coded for one in here], LOWE_RATIO), strict=True
-        ):
+        for window in here:
+            on_other, on_this = feature_matches(picture.features, window.features, LOWE_RATIO)
             whole = window.holds(on_this) & picture.holds(on_other)
             local.append(window.directions(on_this[whole]))
             world.append(picture.directions(on_other[whole]) @ known.rotation.T)
@@ -254,10 +253,9 @@ def matches(latlong: np.ndarray, shown: np.ndarray, shots: Shots) -> tuple[np.nd
     plate = np.nan_to_num(grey(shots.photographs["plate"].rgb()))
     height, width = (n // step * step for n in plate.shape)
     plate = plate[:height, :width].reshape(height // step, step, width // step, step).mean((1, 3))
-    seen = visible_windows(latlong, shown, focal)
-    found = feature_matches(coded(plate), [window.coded for window in seen], LOWE_RATIO)
-    local, px = [np.empty((0, 3))], [np.empty((0, 2))]
-    for window, (on_plate, on_window) in zip(seen, found, strict=True):
+    found, local, px = features(coded(plate)), [np.empty((0, 3))], [np.empty((0, 2))]
+    for window in visible_windows(latlong, shown, focal):
+        on_plate, on_window = feature_matches(found, window.features, LOWE_RATIO)
         whole = window.holds(on_window)
         local.append(window.directions(on_window[whole]))
         px.append(on_plate[whole] * step)
@@ -266,9 +264,9 @@ def matches(latlong: np.ndarray, shown: np.ndarray, shots: Shots) -> tuple[np.nd
 
 @dataclass(frozen=True)
 class Window:
-    """A perspective window onto a lat-long picture: uint8 tones and which pixels are shown (N, N)."""
+    """A perspective window onto a lat-long picture: its features, and which pixels are shown (N, N)."""
 
-    coded: np.ndarray
+    features: Features
     shown: np.ndarray
     map_from_window: np.ndarray
     focal: float
@@ -295,7 +293,8 @@ def visible_windows(latlong: np.ndarray, shown: np.ndarray, focal: float) -> lis
         crop = bilinear(around, u * latlong.shape[1] + 1, v * latlong.shape[0])
         whole = crop[..., 1] > 0.999
         if whole.mean() > 0.3:
-            found.append(Window(coded(np.where(whole, crop[..., 0], 0)), whole, rotation, focal))
+            tones = coded(np.where(whole, crop[..., 0], 0))
+            found.append(Window(features(tones), whole, rotation, focal))
     return found
 
 

@@ -23,6 +23,7 @@ from pipeline.run.formats import read_latlong
 from pipeline.types import Raster
 
 QUANTISATION = 2**-9 / np.sqrt(3)  # of the brightest channel: eight bits of mantissa, the worst of the two formats
+RINGING = 1e-4  # of the light: less below zero is a resampling filter's, and only counted
 PLATEAU = 4  # texels that share the largest value exactly
 
 
@@ -73,11 +74,15 @@ def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
     clipped = np.asarray(infinite | (peak >= limit))
     rgb, space = to_acescg(rgb / float(raster.attributes.get("exposure", 1.0)), raster, probe.get("space"))
     negative = (rgb < 0).any(-1) & ~nan
+    missing = float(-rgb[rgb < 0].sum() / max(float(np.abs(rgb).sum()), 1e-300))
     warnings = []
     for count, said in (
         (int(nan.sum()), "are not a number; taken as not seen"),
         (int(infinite.sum()), f"are infinite; taken as clipped at {largest:.4g}, a lower bound"),
-        (int(negative.sum()), "are negative in ACEScg; set to zero"),
+        (
+            int(negative.sum()) * (missing > RINGING),
+            f"are negative in ACEScg ({missing:.2%} of the light); set to zero",
+        ),
     ):
         if count:
             warnings.append(f"{probe['kind']}: {count} texels {said}")
