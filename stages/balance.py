@@ -59,8 +59,16 @@ def compute(
             balances[view], numbers[view] = measured(view, pairs, warnings)
         else:
             balances[view], numbers[view] = assumed(exposures, view, own)
+            if own and view in balls:
+                warnings.append(
+                    f"{view}: another camera than the plate's and no reference that both saw: its exposure is uncertain "
+                    f"by {LABEL_SIGMA:.0%}, its colour by {COLOUR_SIGMA:.0%}; lay a grey card in both: [[reference]]"
+                )
         evidence.append(reason(view, balances[view], numbers[view], own))
         evidence += [matrix_reason(view, pair) for pair in pairs if np.isfinite(pair.residual)]
+    for one in references:
+        if "plate" not in outlines(one):
+            warnings.append(f"reference {one['name']}: the plate does not show it, so it ties nothing; take it out")
     grey = plate_neutral(references, photographs["plate"])
     if grey is not None:
         numbers["plate_neutral"] = {"slope": np.exp(grey.log).tolist(), "sigma_rel": sigma_of(grey.covariance)}

@@ -241,6 +241,8 @@ def test_without_a_reference_the_gains_are_one_and_how_sure_that_is_is_said(shot
     assert np.sqrt(same.covariance[0, 0]) == pytest.approx(0.003)
     assert two.numbers["ball"]["exposure_sigma_rel"] > 0.05
     assert "unknown" in two.evidence[0]["because"]
+    assert "lay a grey card in both" in two.warnings[0]
+    assert one.warnings == []
     assert (other.gains == 1).all()
     assert estimate.shared_sigma(two.outputs["balance"], "ball") == pytest.approx(np.full(3, np.hypot(0.05, 0.05)))
     assert (estimate.shared_sigma({}, "ball") == 0).all()
@@ -262,6 +264,10 @@ def test_clipped_and_tiny_cards_are_left_out_with_a_reason(shots):
         result = stage([reference], taken)
         assert result.outputs["balance"]["ball"].references == []
         assert "needed 8 in common; left out; is it clipped, too small or hidden" in result.warnings[0]
+
+
+def test_a_reference_that_the_plate_does_not_show_is_pointed_out(shots):
+    assert "the plate does not show it" in stage([card(ball=CARD["ball"])], shots).warnings[-1]
 
 
 def test_corners_of_a_chart_in_wrong_order_are_refused(shots):
