@@ -10,6 +10,7 @@ import pytest
 from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
+from pipeline.light import near_field
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
 from pipeline.probes import reflection
 from pipeline.probes.combine import merge
@@ -281,6 +282,29 @@ def test_clipped_lamp_is_a_lower_bound(shots):
     assert found.numbers["clipped_texels"] > 0
     assert any("lower bound" in warning for warning in found.warnings)
     assert np.isfinite(found.outputs["environment"].rgb("variance")).all()
+
+
+def test_room_moves_the_map_to_the_objects(shots, result):
+    box = {"centre_m": [0.1, 0.8, 0.0], "size_m": [2.2, 2.4, 2.0], "yaw_deg": 15.0}
+    wishes = {"object": [{"position_m": [0.3, 0.1]}]}
+    photographs = {name: shots["photographs"][name] for name in ("plate", "ball_a", "ball_b")}
+
+    def moved(budget: float, room: dict[str, Any]):
+        return probe.compute(
+            facts(("ball_a", True), ("ball_b", False)) | {"room": room}, photographs, shots["camera"], shots["views"],
+            {}, wishes, knobs.Probe(width=256, supersample=2, near_budget=budget),
+        )  # fmt: skip
+
+    found = moved(0.001, box)
+    environment, before = found.outputs["environment"], result.outputs["environment"].rgb()
+    assert found.numbers["near_irradiance_error"] > found.numbers["near_irradiance_error_left"] == 0
+    assert not np.allclose(environment.rgb(), before)
+    room = near_field.room_of({"room": box})
+    again = near_field.at_probe(environment.rgb(), environment.attributes, room)
+    assert irradiance(again, AXES) == pytest.approx(irradiance(before, AXES), rel=0.02)
+    assert np.array_equal(moved(1.0, box).outputs["environment"].rgb(), before)  # bit for bit
+    with pytest.raises(CaptureError, match="room: the probe"):
+        moved(1.0, box | {"centre_m": [9.0, 1.0, 0.0]})
 
 
 # ---- refused and flagged -------------------------------------------------------------------------------------------
