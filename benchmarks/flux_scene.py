@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.lens import pixel_rays, project
-from pipeline.conventions import CLIPPED, invert_rigid, transform_points
+from pipeline.conventions import (
+    CLIPPED,
+    invert_rigid,
+    latlong_directions,
+    latlong_solid_angles,
+    transform_points,
+)
 from pipeline.types import Camera, Raster, View
 
 RADIUS = 0.04
@@ -370,3 +376,24 @@ def facts(scene: Scene) -> dict[str, Any]:
 def with_lamps(scene: Scene, *lamps: Lamp) -> Scene:
     """The same place under other lamps."""
     return replace(scene, lamps=lamps)
+
+
+def true_map(scene: Scene, fluxes: list[np.ndarray], clip: float, height: int = 128) -> tuple[np.ndarray, np.ndarray]:
+    """The map (H, 2H, 3) that a perfect probe would give of the free table, and what of it is clipped (H, 2H).
+
+    Lamps are blurred to 1 degree and cut at ``clip``.
+    """
+    w = latlong_directions(height, 2 * height).reshape(-1, 3)
+    up = w[:, 1] > 0
+    rgb = np.zeros(w.shape)
+    rgb[up] = scene.sky(w[up])
+    total = sky_irradiance(scene)
+    for lamp, flux in zip(scene.lamps, fluxes, strict=True):
+        angle = np.arccos(np.clip(w @ lamp.direction, -1, 1))
+        shape = np.exp(-0.5 * (angle / np.radians(1)) ** 2) * up
+        rgb += flux * (shape / (shape @ latlong_solid_angles(height, 2 * height).ravel()))[:, None]
+        total = total + max(lamp.direction[1], 0) * flux
+    rgb[~up] = albedo(on_table(np.broadcast_to(CENTRE, w[~up].shape), w[~up] - (0, 1e-9, 0))) / np.pi * total
+    over = (rgb > clip).any(-1) & up
+    rgb[over] = np.minimum(rgb[over], clip)
+    return rgb.reshape(height, -1, 3), over.reshape(height, -1).astype(float)

@@ -128,8 +128,9 @@ def _channel(
     scale = np.linalg.norm(matrix[:, :count], axis=0)
     others = np.maximum(np.linalg.norm(matrix[:, count:], axis=0), 1e-300)
     scaled = matrix / np.concatenate([np.where(scale > 0, scale, np.inf), others])
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
+    _, singular, right = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
+    told = len(singular) == len(right) and singular[-1] > 0
+    condition = float(singular[0] / singular[-1]) if told else np.inf
     points = len(shadow.ratio) if shadow else 0
     dof = max(points - int((scale > 0).sum()) - 1, 1)
     chi2 = float((robust[:points] * gap[:points] ** 2).sum() / dof)
@@ -178,6 +179,9 @@ def _rows(
 
 def _covariance(matrix: np.ndarray, gap: np.ndarray, cluster: np.ndarray, robust: np.ndarray) -> np.ndarray:
     """(P, P): of clustered residuals, or of the rows' own noise where that is larger (variance by variance)."""
+    scale = np.linalg.norm(matrix, axis=0)
+    scale = np.where(scale > 0, scale, 1)
+    matrix = matrix / scale  # fluxes and exposures differ by orders of magnitude, which is no rank deficiency
     bread = np.linalg.pinv((matrix * robust[:, None]).T @ matrix)
     label, index = np.unique(cluster, return_inverse=True)
     score = np.zeros((len(label), matrix.shape[1]))
@@ -185,4 +189,4 @@ def _covariance(matrix: np.ndarray, gap: np.ndarray, cluster: np.ndarray, robust
     small = len(label) / max(len(label) - matrix.shape[1], 1)
     clustered = bread @ (score.T @ score * small) @ bread
     grow = np.sqrt(np.maximum(np.diag(clustered) / np.maximum(np.diag(bread), 1e-300), 1))
-    return np.asarray(bread * np.outer(grow, grow))
+    return np.asarray(bread * np.outer(grow / scale, grow / scale))

@@ -21,7 +21,7 @@ from pipeline.light.emitters import Sky, components, lights
 from pipeline.light.environment import irradiance, resize_environment
 from pipeline.light.flux import Card, Fluxes, Shadow, solve
 from pipeline.probes.observation import Observation, Shots, ViewMap
-from pipeline.probes.shadow_blocks import Blocks, plane_blocks
+from pipeline.probes.shadow_blocks import MODEL, Blocks, plane_blocks
 
 PART = 0.05  # of a texel that is clipped: from here on it is a lower bound
 HALO, RING = np.radians(5.0), np.radians(6.0)  # how far glare is followed beyond what is clipped; width of the ring
@@ -32,7 +32,7 @@ KNOWN_SHARE = 0.003  # of the light: lamps that are not clipped and are kept apa
 LOWEST = 0.05  # cosine with the plane's normal below which a lamp hardly lights it
 SKY_ROWS = 128  # of the smooth map that is looked up
 TURNS, SETTLED = 6, 1e-3  # of fluxes and albedo by turns; change of the irradiance
-POINTS = 2400  # blocks of pixels that are looked at, at most
+POINTS = 1600  # blocks of pixels that are looked at, at most
 LEAST = 12  # blocks in a lamp's full shadow
 WORST_CONDITION = 30.0
 INVOLVED = 0.3  # of the least determined combination of fluxes, from where on a lamp takes part in it
@@ -186,9 +186,13 @@ def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Ans
 def systematic(seen: Witness, rest: Setting, asked: list[Light], fluxes: Fluxes) -> np.ndarray:
     """Variance (K, 3) of fluxes that no number of points averages out.
 
-    Of the sky's own irradiance, of the scale of the map, and of the cosine of a lamp whose middle is uncertain.
+    Of the sky's own irradiance, of the scale of the map, of what the model of the shadow leaves out (taken as one error
+    of all points of a shadow), and of the cosine of a lamp whose middle is uncertain.
     """
     total = fluxes.value**2 * ((rest.free_sigma / rest.free) ** 2 + np.square(seen.scale_sigma))
+    cosine = np.array([light.direction[1] for light in asked])
+    everything = rest.free + cosine @ fluxes.value
+    total = total + (MODEL * everything / cosine[:, None]) ** 2
     tilt = np.array([DIRECTION_SIGMA * np.hypot(*light.direction[[0, 2]]) / light.direction[1] for light in asked])
     total = total + (fluxes.value * tilt[:, None]) ** 2
     return np.asarray(total)

@@ -12,7 +12,7 @@ from pipeline.types import BallFit, Camera, Raster
 
 REACH = 9.0  # ball radii around the foot that are looked at: the shadow of a lamp 13 degrees above the plane
 BLOCKS_PER_RADIUS, OUTLINE_PX = 20, 4.0
-MODEL = 0.002  # of the ratio: what the model of a shadow leaves out point by point
+MODEL = 0.002  # of the free irradiance: what the model of a shadow leaves out (1e-3 rms at 1.2 radii, on truth)
 
 
 @dataclass(frozen=True)
