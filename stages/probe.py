@@ -1,8 +1,9 @@
 """Turn photographs of a probe into a world-oriented environment map with variance.
 
 What the probe is, is a kind of its own (`pipeline.probes.kinds`): it gives one map per view. Views are brought to one
-exposure and averaged by the inverse variance of their direction. Limits: light is taken as distant; lamps clipped in
-every frame are lower bounds; directions that nobody sees are filled smoothly and marked by ``seen`` = 0.
+exposure and averaged by inverse variance. Limits: light is distant unless [room] says how far; lamps clipped in
+every frame are lower bounds unless their shadow tells (`pipeline.probes.clipped`); directions that nobody sees are
+filled smoothly and marked by ``seen`` = 0.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pipeline.image.balance import balanced
 from pipeline.light import near_field
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
-from pipeline.probes import combine, filling, levelling
+from pipeline.probes import clipped, combine, filling, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
 from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS, WISHES
@@ -33,14 +34,13 @@ def compute(
     """Fitted balls, and the light at the probe (H, W) with H = width / 2, world frame."""
     photographs = balanced(photographs, balance)
     grid = Grid(params.width, params.supersample, params.rim)
-    observed = KINDS[facts["probe"]["kind"]].observe(Shots(facts, photographs, camera, views), grid)
+    shots = Shots(facts, photographs, camera, views)
+    observed = KINDS[facts["probe"]["kind"]].observe(shots, grid)
     maps, warnings = dict(observed.maps), list(observed.warnings)
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
     merged = combine.merge(list(maps.values()))
     rgb, variance, seen = merged.rgb, merged.variance, merged.seen
-    clipped = np.max([np.broadcast_to(view.clipped, seen.shape) for view in maps.values()], 0)
-    lamp = clipped_numbers(rgb, clipped, seen, warnings)
     known = np.minimum(seen * 4, 1)
     rgb, variance, laid = combine.lay_plate(
         rgb, variance, known, lookup_channels(photographs["plate"])[..., :7], camera,
@@ -50,24 +50,31 @@ def compute(
     gap = filling.prior(rgb, known)
     rgb = filling.fill(rgb, known)
     variance = filling.filled_variance(rgb, variance, known, gap)
+    over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - laid)
+    lamps = clipped.recover(rgb, variance, over, clipped.witness(shots, observed))
+    rgb, variance = lamps.rgb, lamps.variance
     centre, room = observed.centre_world, near_field.room_of(facts)
     if room and not room.holds(centre):
         raise CaptureError(
             f"room: the probe, at {np.round(centre, 2).tolist()} m, lies outside; correct centre_m, size_m"
         )
     near = near_field.assess(rgb, centre, near_field.places_of(wishes, centre[1]), room, params.near_budget)
+    recovered = lamps.recovered
     if room and near.target is not None:
-        rgb, variance, rest = near_field.relocate([rgb, variance, seen[..., None]], room.depth, centre, near.target)
-        seen = rest[..., 0]
+        maps_of = [rgb, variance, np.stack([seen, over, recovered], -1)]
+        rgb, variance, rest = near_field.relocate(maps_of, room.depth, centre, near.target)
+        seen, over, recovered = np.moveaxis(rest, -1, 0)
     numbers |= near.numbers
     numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
     numbers |= combine.disagreement_numbers(merged) | filling.report(rgb, known, gap)
-    numbers |= lamp | map_numbers(rgb, seen)
+    numbers |= clipped_numbers(lamps) | map_numbers(rgb, seen)
     environment = Raster(
         {
             **Raster.split(rgb.astype(np.float32)),
             **Raster.split(variance.astype(np.float32), "variance"),
             "seen": seen.astype(np.float32),
+            "clipped": over.astype(np.float32),
+            "recovered": recovered.astype(np.float32),
         },
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
@@ -77,7 +84,8 @@ def compute(
         coefficients=sh9_of_environment(rgb), sigma=sh9_sigma(variance), irradiance_factors=COSINE_LOBE
     )
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
-    return Result(outputs, numbers, [*warnings, *near.warnings], [*observed.evidence, *reasons(applied), near.evidence])
+    evidence = [*observed.evidence, *lamps.evidence, *reasons(applied), near.evidence]
+    return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
 
 
 def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
@@ -102,17 +110,13 @@ def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str
     return figures, applied
 
 
-def clipped_numbers(rgb: np.ndarray, clipped: np.ndarray, seen: np.ndarray, warnings: list[str]) -> dict[str, Any]:
-    """How much of the light is a lower bound."""
-    touched = (clipped > 0.5) & (seen > 0)
-    weighted = rgb.mean(-1) * latlong_solid_angles(*seen.shape)
-    share = float(weighted[touched].sum() / max(float(weighted.sum()), 1e-300))
-    if touched.any():
-        warnings.append(
-            f"{int(touched.sum())} texels are clipped in every frame ({share:.1%} of the light, a lower bound); add a "
-            "shorter exposure or an ND filter"
-        )
-    return {"clipped_texels": int(touched.sum()), "clipped_light_lower_bound_rel": share}
+def clipped_numbers(found: clipped.Recovered) -> dict[str, Any]:
+    """How much of the light is a lower bound, and what is known of each clipped lamp."""
+    weighted = found.rgb.mean(-1) * latlong_solid_angles(*found.clipped.shape)
+    bound = (found.clipped > clipped.PART) & (found.recovered == 0)
+    share = float(weighted[bound].sum() / max(float(weighted.sum()), 1e-300))
+    touched = int((found.clipped > clipped.PART).sum())
+    return {"clipped_texels": touched, "clipped_light_lower_bound_rel": share, **found.numbers}
 
 
 def map_numbers(rgb: np.ndarray, seen: np.ndarray) -> dict[str, Any]:
