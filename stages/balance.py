@@ -61,7 +61,7 @@ def compute(
             balances[view], numbers[view] = assumed(exposures, view, own)
             if own and view in balls:
                 warnings.append(
-                    f"{view}: another camera than the plate's and no reference that both saw: its exposure is uncertain "
+                    f"{view}: another camera than the plate's, no reference that both saw: its exposure is uncertain "
                     f"by {LABEL_SIGMA:.0%}, its colour by {COLOUR_SIGMA:.0%}; lay a grey card in both: [[reference]]"
                 )
         evidence.append(reason(view, balances[view], numbers[view], own))
