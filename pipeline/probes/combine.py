@@ -19,6 +19,7 @@ from pipeline.probes.observation import Quality, ViewMap
 from pipeline.types import Camera
 
 WEIGHT_ROWS = 64  # rows of the grid on which views are weighed: cells of 2.8 degrees, wider than views are displaced
+LEAST_SHARE = 0.05  # of the weight: a view that has less was set aside, and does not contradict
 FLOOR = 0.003  # relative: below it two views are equally good
 SIGNIFICANT = 3.0  # standard deviations
 
@@ -118,12 +119,12 @@ def disagreement(views: list[ViewMap], share: np.ndarray, rgb: np.ndarray, varia
     """Squared differences from the mean over expected ones (H, W), on cells of 2.8 degrees, never below 1.
 
     ``E (L_v - m)^2 = V_v (1 - 2 s_v) + V_m`` with shares ``s`` and the mean's variance ``V_m``. Only what exceeds 1 by
-    three standard deviations of so many independent pixels counts; a cell that one view sees alone keeps 1.
+    three standard deviations of so many independent pixels counts; a cell that is one view's alone keeps 1.
     """
     rows, squares, expected = min(WEIGHT_ROWS, rgb.shape[0]), 0.0, 0.0
     pixels = np.zeros(rgb.shape[:2])
     for part, view in zip(share, views, strict=True):
-        valid = (part > 0) & (part < 1)
+        valid = (part > LEAST_SHARE) & (part < 1 - LEAST_SHARE)
         allowed = (view.variance * (1 - 2 * part[..., None]) + variance).mean(-1)
         squares = squares + part * np.where(valid, ((view.rgb - rgb) ** 2).mean(-1), 0)
         expected = expected + part * np.where(valid, np.maximum(allowed, 0), 0)
@@ -139,7 +140,7 @@ def disagreement_numbers(merged: Merged) -> dict[str, float]:
     """How much of the sphere, and of the light, was seen twice and differently, and the root of the worst ratio."""
     weight = latlong_solid_angles(*merged.seen.shape)
     light = weight * merged.rgb.mean(-1)
-    several = merged.share.max(0) < 0.99
+    several = merged.share.max(0) < 1 - LEAST_SHARE
     differs = (merged.disagreement > 1) & several
     both = float((several * weight).sum())
     return {
