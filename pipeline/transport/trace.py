@@ -35,12 +35,16 @@ class Rays:
     @classmethod
     def of(cls, world_from_camera: np.ndarray, xn: np.ndarray, dxn: np.ndarray) -> Rays:
         """From undistorted coordinates (N, 2) of pixel centres and their derivatives by the pixel (N, 2, 2)."""
-        rotation = world_from_camera[:3, :3]
+        right, down, forward = world_from_camera[:3, :3].T
+
+        def turned(x: np.ndarray, y: np.ndarray) -> np.ndarray:  # a matrix product this thin takes five times as long
+            return np.asarray(x[:, None] * right + y[:, None] * down)
+
         return cls(
             world_from_camera[:3, 3],
-            np.concatenate([xn, np.ones((len(xn), 1))], 1) @ rotation.T,
-            dxn[:, :, 0] @ rotation[:, :2].T,
-            dxn[:, :, 1] @ rotation[:, :2].T,
+            turned(xn[:, 0], xn[:, 1]) + forward,
+            turned(dxn[:, 0, 0], dxn[:, 1, 0]),
+            turned(dxn[:, 0, 1], dxn[:, 1, 1]),
         )
 
     def __getitem__(self, index: Any) -> Rays:
