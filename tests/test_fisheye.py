@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import dng, tiny
 from lit_room import EYE, GRID, ROOM, facts, room_light, room_plate, shots, stage_on
 
 from pipeline.camera.rigid import rotation_log
@@ -18,7 +19,9 @@ from pipeline.probes import combine, fisheye
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid
 from pipeline.run import formats
+from pipeline.run.errors import CaptureError
 from pipeline.types import Raster
+from stages import ingest, knobs
 
 # ---- fisheye photographs ---------------------------------------------------------------------------------------------
 
@@ -119,3 +122,28 @@ def test_stage_takes_a_fisheye_pair(tmp_path):
     # 4 %: 3 sigma of the scale's 1 %, and pixels of 1.1 degrees
     assert irradiance(found, AXES) == pytest.approx(irradiance(expected, AXES), rel=0.04)
     assert result.numbers["seen_fraction"] > 0.99
+
+
+def test_brackets_and_files_of_fisheyes_are_indexed(tmp_path):
+    """RAW of another size than the plate's is a view of its own; a picture file is found, digested, and judged."""
+    folder = tiny(tmp_path)
+    dng(folder / "front.dng", np.full((60, 80), 300, np.uint16))
+    formats.write_exr(folder / "back.exr", Raster(Raster.split(np.ones((10, 12, 3), np.float32)), "acescg"))
+    text = (folder / "capture.toml").read_text()
+    start, end = text.index("[[ball]]"), text.index("[board]")
+    lens = '[[probe.fisheye]]\nname = "{}"\n{}\nfov_deg = 190\nradius_px = 30\nyaw_deg = 0\n'
+    told = '[probe]\nkind = "fisheye_pair"\n' + lens.format("front", 'files = ["front.dng"]')
+    told += lens.format("back", 'file = "back.exr"')
+    (folder / "capture.toml").write_text(text[:start] + told + text[end:])
+    outputs = ingest.compute(folder, None, knobs.Ingest()).outputs
+    assert {name: bracket.role for name, bracket in outputs["brackets"].items()} == {
+        "plate": "plate",
+        "front": "fisheye",
+    }
+    front, back = outputs["facts"]["probe"]["fisheye"]
+    assert back["path"].endswith("back.exr")
+    assert len(back["sha256"]) == 64
+    assert "path" not in front
+    (folder / "back.exr").write_bytes(b"no picture")
+    with pytest.raises(CaptureError, match=r"back\.exr: not a readable EXR"):
+        ingest.compute(folder, None, knobs.Ingest())

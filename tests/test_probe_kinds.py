@@ -254,7 +254,7 @@ REAL = sorted(DATA.glob("env_*/*.*"))
 @pytest.mark.skipif(not REAL, reason="no maps under INSITU_DATA")
 def test_real_maps_are_read_and_keep_their_energy():
     for path in REAL:
-        light = clean(formats.read_latlong(path), {"path": str(path), "kind": "map"})
+        light = clean(formats.read_latlong(path), {}, path.name)
         assert light.valid.all()
         turn = turned(light.channels(), rotation_of(77.0, np.array([0.1, 1.0, 0.0])), 64, 128, 2)
         # 3 %: suns of one texel, as above; most maps stay within 0.3 %

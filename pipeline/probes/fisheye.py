@@ -64,7 +64,7 @@ def picture_of(lens: dict[str, Any], shots: Shots) -> tuple[np.ndarray, list[str
     """(h, w, 8) as `lookup_channels`, of a file or of a developed bracket, and warnings."""
     if not lens.get("path"):
         return lookup_channels(shots.photographs[lens["name"]]), []
-    light = clean(read_linear(Path(lens["path"])), shots.facts["probe"] | {"path": lens["path"]})
+    light = clean(read_linear(Path(lens["path"])), shots.facts["probe"], lens["name"])
     noise = float(shots.facts["probe"]["sigma_rel"])
     variance = (noise * light.rgb) ** 2 + (QUANTISATION * light.rgb.max(-1, keepdims=True)) ** 2
     channels = np.dstack([light.rgb, variance, light.valid, light.clipped]) * light.valid[..., None]

@@ -31,7 +31,7 @@ class Panorama:
     def observe(self, shots: Shots, grid: Grid) -> Observation:
         """One map. Raises CaptureError when nothing says how the panorama is turned."""
         probe = shots.facts["probe"]
-        light = clean(read_latlong(Path(probe["path"])), probe)
+        light = clean(read_latlong(Path(probe["path"])), probe, "panorama")
         found = oriented(light, shots)
         turn = turned(light.channels(), found.rotation, grid.height, grid.width, grid.supersample)
         up = found.rotation @ np.array(probe["up"], float) / np.linalg.norm(probe["up"])

@@ -48,15 +48,15 @@ class ReadyMade:
     def observe(self, shots: Shots, grid: Grid) -> Observation:
         """One map, turned by ``yaw_deg`` and ``up``. Raises CaptureError or ArtifactError for an unusable file."""
         probe = shots.facts["probe"]
-        light = clean(read_latlong(Path(probe["path"])), probe)
+        light = clean(read_latlong(Path(probe["path"])), probe, "map")
         rotation = rotation_of(float(probe["yaw_deg"]), np.array(probe["up"], float))
         turn = turned(light.channels(), rotation, grid.height, grid.width, grid.supersample)
         sigma = float(np.radians(probe["orientation_sigma_deg"]))
         return finished("map", light, turn, sigma, shots, taken_here=probe["position_m"] is not None)
 
 
-def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
-    """The file's map as non-negative ACEScg, with everything that had to be mended counted.
+def clean(raster: Raster, probe: dict[str, Any], name: str) -> LatLong:
+    """A file's picture as non-negative ACEScg, with everything that had to be mended counted; ``name`` is for messages.
 
     NaN is not seen; infinite is clipped at the largest finite value; what is negative in ACEScg becomes zero. Raises
     CaptureError when nothing positive is left.
@@ -65,7 +65,7 @@ def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
     nan, infinite = np.isnan(rgb).any(-1), np.isposinf(rgb).any(-1)
     usable = np.isfinite(rgb).all(-1)
     if not (rgb[usable] > 0).any():
-        raise CaptureError(f"{probe['path']}: no texel is positive, needed light; is it the right file?")
+        raise CaptureError(f"{name}: no texel is positive, needed light; is it the right file?")
     largest = float(rgb[usable].max())
     rgb = np.nan_to_num(rgb, nan=0.0, posinf=largest, neginf=0.0)
     peak = rgb.max(-1)
@@ -85,10 +85,10 @@ def clean(raster: Raster, probe: dict[str, Any]) -> LatLong:
         ),
     ):
         if count:
-            warnings.append(f"{probe['kind']}: {count} texels {said}")
+            warnings.append(f"{name}: {count} texels {said}")
     if plateau >= PLATEAU and not clipped.any():
         warnings.append(
-            f"map: {plateau} texels share the largest value {largest:.6g}: if a lamp was clipped there, its light is a "
+            f"{name}: {plateau} texels share the largest value {largest:.6g}: if a lamp was clipped there, its light is a "
             f"lower bound; say so by probe.clipped_at = {largest:.6g}"
         )
     numbers = {
