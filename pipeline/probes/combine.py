@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.lens import project
-from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
+from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_solid_angles, transform_points
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.filling import enlarge
@@ -21,6 +21,7 @@ from pipeline.types import Camera
 WEIGHT_ROWS = 64  # rows of the grid on which views are weighed: cells of 2.8 degrees, wider than views are displaced
 LEAST_SHARE = 0.05  # of the weight: a view that has less was set aside, and does not contradict
 FLOOR = 0.003  # relative: below it two views are equally good
+PLATE_SPLIT, PLATE_SIGMA_PX = 2, 0.5  # lookups per texel and axis; blur and misplacement of the plate's pixels
 SIGNIFICANT = 3.0  # standard deviations
 
 
@@ -160,25 +161,40 @@ def lay_plate(
     The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same
     plane, taken as diffuse, without it. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees down, fully from
     11: within 8 radii of the foot. ``known`` (H, W) in [0, 1] says how far the map is measured. Returns radiance,
-    variance, and the share (H, W) of the plate.
+    variance, and the share (H, W) of the plate. A texel is the mean of 2 x 2 lookups; half a pixel of misplacement of
+    what the plate shows is in its variance.
     """
     height, width = known.shape
-    w = latlong_directions(height, width)
-    down = np.minimum(w[..., 1], -1e-6)
-    foot = centre - w * (centre[1] / down)[..., None]
-    px = project(camera, transform_points(invert_rigid(world_from_camera), foot).reshape(-1, 3)).reshape(
-        height, width, 2
-    )
-    size = np.array([camera.width, camera.height])
-    inside = ((px > 1) & (px < size - 1)).all(-1)
-    found = bilinear(planes(plate), np.where(inside, px[..., 0], 0), np.where(inside, px[..., 1], 0))
-    share = ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
+    first = int(height * (0.5 + np.radians(7.0) / np.pi))
+    groups = planes(_displaced(plate))
+    sums = np.zeros((height - first, width, 7))
+    for row, column in np.ndindex(PLATE_SPLIT, PLATE_SPLIT):
+        v = (np.arange(first, height) + (row + 0.5) / PLATE_SPLIT) / height
+        u = (np.arange(width) + (column + 0.5) / PLATE_SPLIT) / width
+        w = direction_from_latlong(*np.meshgrid(u, v))
+        foot = centre - w * (centre[1] / w[..., 1])[..., None]
+        px = project(camera, transform_points(invert_rigid(world_from_camera), foot).reshape(-1, 3))
+        px = px.reshape(*w.shape[:2], 2)
+        inside = ((px > 1) & (px < (camera.width - 1, camera.height - 1))).all(-1)
+        found = bilinear(groups, np.where(inside, px[..., 0], 0), np.where(inside, px[..., 1], 0))
+        weight = ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
+        sums += weight[..., None] * np.concatenate([found[..., :6], np.ones_like(found[..., :1])], -1)
+    laid = np.zeros((height, width, 7))
+    laid[first:] = sums / np.where(sums[..., 6:] > 0, sums[..., 6:], 1)
+    share = np.zeros((height, width))
+    share[first:] = sums[..., 6] / PLATE_SPLIT**2
     rest = (1 - share) * known
     total = np.where(share + rest > 0, share + rest, 1)
     parts = [(weight / total)[..., None] for weight in (share, rest)]
-    mixed = parts[0] * found[..., :3] + parts[1] * rgb
-    spread = parts[0] ** 2 * found[..., 3:6] + parts[1] ** 2 * np.where(parts[1] > 0, variance, 0)
+    mixed = parts[0] * laid[..., :3] + parts[1] * rgb
+    spread = parts[0] ** 2 * laid[..., 3:6] + parts[1] ** 2 * np.where(parts[1] > 0, variance, 0)
     return mixed, spread, share
+
+
+def _displaced(plate: np.ndarray) -> np.ndarray:
+    """The plate (h, w, 7) with the variance of a misplacement of half a pixel added to that of its noise."""
+    slope = sum(np.square(np.gradient(plate[..., :3], axis=axis)) for axis in (0, 1))
+    return np.concatenate([plate[..., :3], plate[..., 3:6] + PLATE_SIGMA_PX**2 * slope, plate[..., 6:]], -1)
 
 
 def gradient_per_radian(rgb: np.ndarray) -> np.ndarray:
