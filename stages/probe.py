@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
-from pipeline.image.balance import balanced
-from pipeline.light import near_field
+from pipeline.image.balance import balanced, shared_sigma
+from pipeline.light import near_field, smooth
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import clipped, combine, filling, levelling
@@ -40,7 +40,9 @@ def compute(
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
     merged = combine.merge(list(maps.values()))
-    rgb, variance, seen = merged.rgb, merged.variance, merged.seen
+    rgb, seen = merged.rgb, merged.seen
+    shared = np.hypot(observed.scale_sigma, shared_sigma(balance, next(iter(maps))))  # by all: merging keeps it
+    variance = merged.variance + (shared * rgb) ** 2
     known = np.minimum(seen * 4, 1)
     rgb, variance, laid = combine.lay_plate(
         rgb, variance, known, lookup_channels(photographs["plate"])[..., :7], camera,
@@ -53,6 +55,8 @@ def compute(
     over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - laid)
     lamps = clipped.recover(rgb, variance, over, clipped.witness(shots, observed))
     rgb, variance = lamps.rgb, lamps.variance
+    if observed.smooth_only:
+        rgb, variance = smooth.reduced(rgb, variance)
     centre, room = observed.centre_world, near_field.room_of(facts)
     if room and not room.holds(centre):
         raise CaptureError(
@@ -80,9 +84,9 @@ def compute(
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
         | near_field.places(centre if near.target is None else near.target, centre),
     )
-    harmonics = Harmonics(
-        coefficients=sh9_of_environment(rgb), sigma=sh9_sigma(variance), irradiance_factors=COSINE_LOBE
-    )
+    coefficients = sh9_of_environment(rgb)
+    sigma = np.hypot(sh9_sigma(variance), np.abs(coefficients) * shared)
+    harmonics = Harmonics(coefficients=coefficients, sigma=sigma, irradiance_factors=COSINE_LOBE)
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
     evidence = [*observed.evidence, *lamps.evidence, *reasons(applied), near.evidence]
     return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
