@@ -70,8 +70,9 @@ def compute(
         seen, over, recovered = np.moveaxis(rest, -1, 0)
     numbers |= near.numbers
     numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
-    numbers |= combine.disagreement_numbers(merged) | filling.report(rgb, known, gap)
-    numbers |= clipped_numbers(lamps) | map_numbers(rgb, seen)
+    differing, filled = combine.disagreement_numbers(merged), filling.report(rgb, known, gap)
+    numbers |= differing | filled
+    numbers |= lamps.numbers | map_numbers(rgb, seen)
     environment = Raster(
         {
             **Raster.split(rgb.astype(np.float32)),
@@ -88,7 +89,8 @@ def compute(
     sigma = np.hypot(sh9_sigma(variance), np.abs(coefficients) * shared)
     harmonics = Harmonics(coefficients=coefficients, sigma=sigma, irradiance_factors=COSINE_LOBE)
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
-    evidence = [*observed.evidence, *lamps.evidence, *reasons(applied), near.evidence]
+    evidence = [*observed.evidence, *lamps.evidence, *reasons(applied)]
+    evidence += [combine.disagreement_reason(differing, len(maps)), filling.reason(filled, gap), near.evidence]
     return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
 
 
@@ -112,15 +114,6 @@ def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str
             applied.append(name)
             warnings.append(f"{name}: {ratio:.3f} +- {ratio * sigma:.3f} times as bright as {names[0]}; brought to it")
     return figures, applied
-
-
-def clipped_numbers(found: clipped.Recovered) -> dict[str, Any]:
-    """How much of the light is a lower bound, and what is known of each clipped lamp."""
-    weighted = found.rgb.mean(-1) * latlong_solid_angles(*found.clipped.shape)
-    bound = (found.clipped > clipped.PART) & (found.recovered == 0)
-    share = float(weighted[bound].sum() / max(float(weighted.sum()), 1e-300))
-    touched = int((found.clipped > clipped.PART).sum())
-    return {"clipped_texels": touched, "clipped_light_lower_bound_rel": share, **found.numbers}
 
 
 def map_numbers(rgb: np.ndarray, seen: np.ndarray) -> dict[str, Any]:

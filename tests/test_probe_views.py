@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mirror_scene import Lamp, sky
+from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
-from pipeline.light.environment import total_energy
+from pipeline.light.environment import resize_environment, total_energy
 from pipeline.probes import combine, filling, levelling, photographer
 from pipeline.probes.observation import Quality, ViewMap
+from pipeline.types import Camera
 
 HEIGHT, WIDTH = 64, 128
 LAMPS = [Lamp((0.3, 0.8, 0.4), 0.12, 200.0), Lamp((-0.6, 0.3, -0.5), 0.15, 30.0)]
@@ -272,6 +273,8 @@ def test_filled_light_grows_uncertain_with_distance_and_a_lamp_is_counted():
     figures = filling.report(filled, known, prior)
     assert figures["filled_fraction"] == pytest.approx((1 - np.cos(np.radians(25))) / 2, rel=0.03)
     assert 0 < figures["filled_light_sigma_rel"] < figures["filled_light_rel"]
+    assert f"{prior.lamps} further trials uncovered a lamp" in filling.reason(figures, prior)["could_cost"]
+    assert not filling.reason(filling.report(truth, np.ones(known.shape), None), None)["modelled"]
 
 
 def test_a_gap_too_wide_for_trials_takes_the_contrast_of_the_map():
@@ -282,3 +285,25 @@ def test_a_gap_too_wide_for_trials_takes_the_contrast_of_the_map():
     assert prior.trials == 0
     assert 0.05 < prior.sigma_rel[0] < 1
     assert filling.prior(truth, np.ones((32, 64))) is None
+
+
+# ---- the plate under the map ---------------------------------------------------------------------------------------
+
+
+def test_laid_plate_lies_within_its_intervals():
+    """A striped plane seen by a lens, against the plane itself; nothing else is known of the map."""
+    camera = Camera(width=300, height=240, fx=380.0, fy=380.0, cx=148.0, cy=121.0)
+    pose, centre = look_at((0.08, 0.3, 0.45), (0.02, 0.0, 0.02)), np.array([0.02, 0.04, 0.01])
+    place = Place(sky([], 0.3), plane=True, ball=None)
+    picture = photograph(place, camera, pose, 3, 0.003, 1)
+    plate = np.concatenate([picture, (0.003 * picture) ** 2, np.ones((240, 300, 1))], -1)
+    w = latlong_directions(256, 512).reshape(-1, 3)
+    truth = resize_environment(place.radiance(np.broadcast_to(centre, w.shape), w).reshape(256, 512, 3), HEIGHT, WIDTH)
+    nothing = np.zeros((HEIGHT, WIDTH, 3))
+    rgb, variance, share = combine.lay_plate(nothing, nothing, nothing[..., 0], plate, camera, pose, centre)
+    whole = share > 0.999
+    z = np.abs(rgb - truth)[whole] / np.sqrt(variance[whole])
+    assert whole.sum() > 500
+    assert np.mean(z < 1.96) > 0.90  # measured 0.99: the variance is a pixel's, and a coarse texel holds many
+    assert np.abs(rgb / truth - 1)[whole].mean() < 0.03
+    assert (share[latlong_directions(HEIGHT, WIDTH)[..., 1] > -0.1] == 0).all()

@@ -6,6 +6,7 @@ Views are weighted by the inverse of a variance that geometry and their common s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -149,6 +150,21 @@ def disagreement_numbers(merged: Merged) -> dict[str, float]:
         "disagreeing_fraction": float((differs * weight).sum()) / max(both, 1e-12),
         "disagreeing_light_rel": float((differs * light).sum()) / max(float((several * light).sum()), 1e-300),
         "disagreement_worst": float(np.sqrt(merged.disagreement.max())),
+    }
+
+
+def disagreement_reason(figures: dict[str, float], views: int) -> dict[str, Any]:
+    """Whether views contradicted each other, and where the variance was raised."""
+    share = figures["disagreeing_fraction"]
+    return {
+        "term": "disagreement of views in the variance",
+        "modelled": share > 0,
+        "because": f"beyond their variances in {share:.1%} of what several views share, "
+        f"{figures['disagreeing_light_rel']:.1%} of its light"
+        if views > 1
+        else "one view only: nothing to compare",
+        "could_cost": "variance too small by up to "
+        f"{figures['disagreement_worst'] ** 2:.0f} where near things, clouds or people moved",
     }
 
 

@@ -11,6 +11,7 @@ Source of the fill: push-pull, Gortler et al., The Lumigraph, 1996.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -202,3 +203,21 @@ def report(filled: np.ndarray, known: np.ndarray, error: Prior | None) -> dict[s
         "filled_trials": error.trials if error else 0,
         "filled_trials_with_lamp": error.lamps if error else 0,
     }
+
+
+def reason(figures: dict[str, float | int], error: Prior | None) -> dict[str, Any]:
+    """Whether anything was filled, and what that can cost."""
+    if error is None:
+        because, cost = "every direction was seen", "nothing"
+    else:
+        source = (
+            f"error from {error.trials} gaps of the same shape in what was seen"
+            if error.trials
+            else "the gap is too wide for trials: the map's own contrast is its error"
+        )
+        because = f"{figures['filled_fraction']:.2%} of the sphere was not seen; {source}"
+        chance = f"; {error.lamps} further trials uncovered a lamp" if error.lamps else ""
+        cost = f"{figures['filled_light_sigma_rel']:.2%} of the light (1 sigma), a lamp hidden there apart{chance}"
+    return {
+        "term": "smooth prior where nobody saw", "modelled": error is not None, "because": because, "could_cost": cost
+    }  # fmt: skip
