@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 from lit_room import GRID, facts, raster
@@ -69,6 +71,7 @@ BALL_CAMERA = Camera(width=260, height=240, fx=700, fy=700, cx=131, cy=118)
 BALL_POSE = look_at((0.25, 0.3, 0.25), (0, RADIUS, 0))
 
 
+@functools.cache
 def ball_shots(light, noise: float = 0.003) -> Shots:
     """One tripod view of the matt ball, and the plate without it."""
     picture = matt_ball(light, BALL_CAMERA, BALL_POSE)

@@ -88,7 +88,7 @@ def clean(raster: Raster, probe: dict[str, Any], name: str) -> LatLong:
             warnings.append(f"{name}: {count} texels {said}")
     if plateau >= PLATEAU and not clipped.any():
         warnings.append(
-            f"{name}: {plateau} texels share the largest value {largest:.6g}: if a lamp was clipped there, its light is a "
+            f"{name}: {plateau} texels share the largest value {largest:.6g}: a lamp clipped there is a "
             f"lower bound; say so by probe.clipped_at = {largest:.6g}"
         )
     numbers = {
