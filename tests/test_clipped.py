@@ -14,6 +14,7 @@ from pipeline.conventions import CLIPPED, invert_rigid, latlong_directions, latl
 from pipeline.light import ball_shadow
 from pipeline.light.flux import Card, Shadow, predicted, solve
 from pipeline.probes import clipped
+from pipeline.probes.clipped_lights import find_lights
 from pipeline.probes.shadow_blocks import plane_blocks
 from pipeline.types import BallFit, Raster
 from stages import knobs
@@ -107,8 +108,30 @@ def test_the_map_holds_the_flux_exactly_and_its_sigma_is_shared(scene, pictures)
     assert np.all(found.recovered[over > 0] == 1)
     gained = ((found.rgb - rgb) * weight).sum((0, 1))
     np.testing.assert_allclose(gained, np.array(row["flux"]) - row["bound"], rtol=1e-9)
-    sigma = (np.sqrt(found.variance) * weight)[touched].sum(0)
+    disc = touched & (found.rgb.min(-1) > 3)  # the rest of the clipped texels shows the sky again
+    sigma = (np.sqrt(found.variance) * weight)[disc].sum(0)
     np.testing.assert_allclose(sigma, row["flux_sigma"], rtol=1e-9)
+
+
+def test_the_shadows_edge_makes_it_a_sun(scene, pictures):
+    """Its picture is blurred to 1 degree and clipped, its shadow's edge is not; texels are 1.4 degrees here.
+
+    The lens blurs the edge by 0.7 px on a ball of 60 px, seen from 1 to 2 radii: 0.3 to 0.7 degrees to either side, and
+    twice that is what a Gaussian's sigma makes of a disc's half angle. So 0.27 degrees may come out as up to 1.4.
+    """
+    found, fluxes, _, _ = case(scene, pictures, [20.0, 0, 0, 0])
+    (row,) = found.numbers["clipped_lights"]
+    assert row["half_angle_deg"] > 2
+    assert 0.1 < row["edge_half_angle_deg"] < 1.4
+    channels = {
+        **Raster.split(found.rgb.astype(np.float32)),
+        **Raster.split(found.variance.astype(np.float32), "variance"),
+    }
+    channels |= {"clipped": found.clipped.astype(np.float32), "recovered": found.recovered.astype(np.float32)}
+    (emitter,) = room.compute(Raster(channels, "acescg"), knobs.Lights()).outputs["emitters"]
+    assert (emitter.name, emitter.evidence, emitter.lower_bound) == ("sun", "recovered", False)
+    assert np.degrees(np.arccos(emitter.direction @ scene.lamps[HIGH].direction)) < 0.7  # half a texel
+    np.testing.assert_allclose(emitter.irradiance, fluxes[HIGH], rtol=0.03)
 
 
 def test_two_lamps_are_told_apart(scene, pictures):
@@ -265,7 +288,7 @@ def test_components_join_over_the_seam_and_glare_belongs_to_its_lamp():
     directions = latlong_directions(height, width)
     angle = np.arccos(np.clip(directions @ np.array([0, 0.6, -0.8]), -1, 1))  # on the seam
     rgb = np.minimum(1 + 1e4 * np.exp(-0.5 * (angle / np.radians(2)) ** 2), 30)[..., None] * np.ones(3)
-    (light,) = clipped.find_lights(rgb, np.asarray(angle < np.radians(5), float))
+    (light,) = find_lights(rgb, np.asarray(angle < np.radians(5), float))
     assert np.degrees(np.arccos(light.direction @ (0, 0.6, -0.8))) < 0.1 * 180 / height
     assert angle.ravel()[light.texels].max() > np.radians(7)
     assert light.around == pytest.approx(1, rel=0.02)

@@ -17,15 +17,14 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light import ball_shadow
-from pipeline.light.emitters import Sky, components, lights
+from pipeline.light.emitters import Sky, lights
 from pipeline.light.environment import irradiance, resize_environment
-from pipeline.light.flux import Card, Fluxes, Shadow, solve
+from pipeline.light.flux import Card, Fluxes, Shadow, predicted, solve
+from pipeline.probes.clipped_lights import PART, Light, find_lights, held_by, light_of, without
 from pipeline.probes.observation import Observation, Shots, ViewMap
 from pipeline.probes.shadow_blocks import MODEL, Blocks, plane_blocks
+from pipeline.probes.shadow_edge import SUN_HALF_ANGLE, Edge, disc_texels, fit_edge
 
-PART = 0.05  # of a texel that is clipped: from here on it is a lower bound
-HALO, RING = np.radians(5.0), np.radians(6.0)  # how far glare is followed beyond what is clipped; width of the ring
-GLARE = 2.0  # times the ring's level: what is brighter belongs to the lamp
 WIDEST = np.radians(10.0)  # half angle; the shadow of a wider one is as soft as the sky's
 MOST = 6  # lamps solved for together
 KNOWN_SHARE = 0.003  # of the light: lamps that are not clipped and are kept apart from the smooth sky
@@ -38,26 +37,12 @@ WORST_CONDITION = 30.0
 INVOLVED = 0.3  # of the least determined combination of fluxes, from where on a lamp takes part in it
 MATTERS = 0.002  # of all light: clipped spots below are only counted
 CELL_ROWS = 16  # cells of 11 degrees
+NARROWER = 0.6  # of the clipped picture's half angle: a sharper edge is believed
 WEAK = 0.5  # relative sigma of a flux from which on the bound says as much
 DIRECTION_SIGMA = np.radians(0.25)  # of a clipped lamp's centroid
 REFLECTANCE_SIGMA = 0.02  # of the ball, for what it mirrors to the plane
 LEVEL = np.diag([1.0, 0.0, 1.0])  # the ball stands on the plane
 DARKER, PATCH = 0.05, 25  # a patch of so many blocks this much darker than predicted: a lamp that the map lacks
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """A clipped lamp: texels (N,), unit direction (3,), half angle; ``bound`` (3,): its flux over its surroundings.
-
-    ``around`` (3,): radiance of the surroundings, which its texels also have; ``shape`` (N, 3): their shares of it.
-    """
-
-    texels: np.ndarray
-    direction: np.ndarray
-    half_angle: float
-    bound: np.ndarray
-    around: np.ndarray
-    shape: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -99,10 +84,11 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     """
     found = find_lights(rgb, clipped)
     if not found:
-        return Recovered(rgb, variance, clipped, np.zeros(clipped.shape), {"clipped_lights": []})
+        nowhere = np.zeros(clipped.shape)
+        return Recovered(rgb, variance, clipped, nowhere, {"clipped_lights": [], **_bounds(rgb, clipped, nowhere)})
     asked, refused = _asked(found)
     verdicts = dict(refused)
-    rest = setting(rgb, np.where(_where(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
+    rest = setting(rgb, np.where(held_by(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
     answers, numbers = _answers(seen, rest, [light for _, light in asked])
     out, spread, recovered = np.array(rgb, float), np.array(variance, float), np.zeros(clipped.shape)
     rows: list[dict[str, Any]] = []
@@ -111,6 +97,8 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
         answer = answers[place] if place is not None else None
         why = verdicts.get(number) or (answer.refused if answer else "")
         if answer is not None and not why:
+            recovered.ravel()[light.texels] = 1
+            light = narrowed(out, spread, light, answer.edge)
             _put(out, spread, light, answer)
             recovered.ravel()[light.texels] = 1
         rows.append(_row(light, answer, why, rest))
@@ -119,7 +107,16 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     if small:
         warnings.append(f"{small} more clipped spots hold less than {MATTERS:.1%} of the light each, as lower bounds")
     evidence = [_reason(number, row) for number, row in enumerate(rows, 1) if row["matters"] or not row["lower_bound"]]
-    return Recovered(out, spread, clipped, recovered, {"clipped_lights": rows, **numbers}, warnings, evidence)
+    numbers = {"clipped_lights": rows, **numbers, **_bounds(out, clipped, recovered)}
+    return Recovered(out, spread, clipped, recovered, numbers, warnings, evidence)
+
+
+def _bounds(rgb: np.ndarray, clipped: np.ndarray, recovered: np.ndarray) -> dict[str, Any]:
+    """How many texels are clipped, and how much of the light is still a lower bound."""
+    weighted = rgb.mean(-1) * latlong_solid_angles(*clipped.shape)
+    touched = clipped > PART
+    share = float(weighted[touched & (recovered == 0)].sum() / max(float(weighted.sum()), 1e-300))
+    return {"clipped_texels": int(touched.sum()), "clipped_light_lower_bound_rel": share}
 
 
 @dataclass(frozen=True)
@@ -131,6 +128,7 @@ class Answer:
     condition: float
     dark_points: int
     refused: str = ""
+    edge: Edge | None = None
 
 
 def _asked(found: list[Light]) -> tuple[list[tuple[int, Light]], dict[int, str]]:
@@ -173,7 +171,8 @@ def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Ans
             why = unseen
         elif np.any(sigma[k] > WEAK * fluxes.value[k]):
             why = "its shadow is too faint to tell"
-        answers.append(Answer(fluxes.value[k], sigma[k], float(fluxes.condition.max()), dark, why))
+        edge = edge_of(seen, rest, asked, k, fluxes.value) if not why and dark >= LEAST else None
+        answers.append(Answer(fluxes.value[k], sigma[k], float(fluxes.condition.max()), dark, why, edge))
     numbers: dict[str, Any] = {"flux_condition": fluxes.condition.tolist()}
     if shadow:
         numbers |= {
@@ -239,6 +238,7 @@ def _row(light: Light, answer: Answer | None, why: str, rest: Setting) -> dict[s
         "half_angle_deg": float(np.degrees(light.half_angle)), "texels": len(light.texels),
         "lower_bound": not told, "bound": light.bound.tolist(), "flux": flux.tolist(),
         "flux_sigma": answer.sigma.tolist() if told and answer else None,
+        "edge_half_angle_deg": float(np.degrees(answer.edge.half_angle)) if answer and answer.edge else None,
         "condition": answer.condition if told and answer else None, "why_not": why, "share": share,
         "matters": share > MATTERS,
     }  # fmt: skip
@@ -270,69 +270,6 @@ def _reason(number: int, row: dict[str, Any]) -> dict[str, Any]:
         "term": f"flux of clipped lamp {number}, {_named(row)}", "modelled": not row["lower_bound"],
         "because": because, "could_cost": cost,
     }  # fmt: skip
-
-
-def find_lights(rgb: np.ndarray, clipped: np.ndarray) -> list[Light]:
-    """Clipped lamps of a map (H, W, 3) with ``clipped`` (H, W), by falling bound; glare around them is theirs."""
-    inside = clipped > PART
-    if not inside.any():
-        return []
-    sky = Sky(rgb)
-    whole = inside.copy()
-    labels = components(inside)
-    for label in np.unique(labels[labels > 0]):
-        whole |= _glare(sky, labels == label, inside)
-    labels = components(whole)
-    found = [_light(sky, np.flatnonzero(labels.ravel() == label)) for label in np.unique(labels[labels > 0])]
-    return sorted(found, key=lambda light: -float(light.bound.mean()))
-
-
-def _ring(sky: Sky, texels: np.ndarray, inner: float) -> tuple[np.ndarray, np.ndarray]:
-    """Angle (H, W) to the middle of texels (N,), and the ring (H, W) that begins ``inner`` beyond them."""
-    directions = sky.directions.reshape(-1, 3)
-    middle = sky.solid_angles.ravel()[texels] @ directions[texels]
-    angle = np.arccos(np.clip(sky.directions @ (middle / np.linalg.norm(middle)), -1, 1))
-    reach = angle.ravel()[texels].max() + inner
-    return angle, (angle > reach) & (angle < reach + RING)
-
-
-def _glare(sky: Sky, part: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Texels (H, W) that hang together with a clipped ``part`` and are brighter than its surroundings."""
-    texels = np.flatnonzero(part)
-    angle, ring = _ring(sky, texels, HALO)
-    ring &= ~inside
-    level = np.median(sky.grey[ring]) if ring.any() else 0.0
-    near = angle < angle.ravel()[texels].max() + HALO
-    labels = components(near & (part | (sky.grey > GLARE * level)))
-    return np.isin(labels, np.unique(labels[part]))
-
-
-def _light(sky: Sky, texels: np.ndarray) -> Light:
-    _, ring = _ring(sky, texels, np.radians(0.5))
-    ring.ravel()[texels] = False
-    values = sky.rgb.reshape(-1, 3)
-    around = np.median(values[ring.ravel()], 0) if ring.any() else np.zeros(3)
-    over = np.maximum(values[texels] - around, 0) * sky.solid_angles.ravel()[texels, None]
-    bound = over.sum(0)
-    share = np.where(bound > 0, over / np.where(bound > 0, bound, 1), 1 / len(texels))
-    patch = sky.patch(texels, float(around.mean()))
-    return Light(texels, patch.direction, patch.half_angle_rad, bound, around, share)
-
-
-def _where(shape: tuple[int, ...], found: list[Light]) -> np.ndarray:
-    """The texels (H, W) of all lamps."""
-    held = np.zeros(shape, bool)
-    for light in found:
-        held.ravel()[light.texels] = True
-    return held
-
-
-def without(rgb: np.ndarray, found: list[Light]) -> np.ndarray:
-    """The map with every lamp replaced by the radiance around it."""
-    rest = np.array(rgb, float)
-    for light in found:
-        rest.reshape(-1, 3)[light.texels] = light.around
-    return rest
 
 
 def clipped_share(share: np.ndarray, maps: list[ViewMap]) -> np.ndarray:
@@ -380,7 +317,7 @@ def setting(rgb: np.ndarray, variance: np.ndarray, found: list[Light]) -> Settin
     whole = without(rgb, found)
     sky = Sky(whole)
     patches = lights(whole, KNOWN_SHARE, WIDEST)[0]
-    known = [_light(sky, patch.texels) for patch in patches]
+    known = [light_of(sky, patch.texels) for patch in patches]
     rest = without(whole, known)
     rows = min(SKY_ROWS, len(rgb))
     free = irradiance(rest, ball_shadow.UP[None])[0]
@@ -452,6 +389,48 @@ def _uncertain(seen: Witness, everyone: list[Light]) -> list[tuple[ball_shadow.B
         turned = [replace(light, direction=turned_by(light.direction, seen, seen.ball)) for light in everyone]
         others.append((replace(seen.ball, centre=seen.ball.centre + seen.shift), turned))
     return others
+
+
+def edge_of(seen: Witness, rest: Setting, asked: list[Light], k: int, flux: np.ndarray) -> Edge | None:
+    """Lamp ``k`` from the edge of its shadow, where no other lamp's edge lies; None if it does not tell."""
+    assert seen.ball is not None
+    assert seen.blocks is not None
+    everyone, blocks = [*asked, *rest.known], seen.blocks
+    distance = np.linalg.norm(blocks.points - seen.ball.centre, axis=-1)
+    use = np.ones(len(blocks.points), bool)
+    for number, light in enumerate(everyone):
+        edge = np.abs(ball_shadow.edge_angle(blocks.points, light.direction, seen.ball))
+        margin = light.half_angle + DIRECTION_SIGMA + blocks.size / distance
+        use &= edge < margin + DIRECTION_SIGMA if number == k else edge > margin
+    index = np.random.default_rng(0).permutation(np.flatnonzero(use))[: POINTS // 4]
+    if not len(index):
+        return None
+    both = np.concatenate([flux, np.array([light.bound for light in rest.known]).reshape(-1, 3)])
+    prepared = _prepared(blocks.points[index], seen.ball, rest, everyone)
+    reach = prepared.reach(rest.free + prepared.cosine @ both)
+    step = prepared.cosine[k] * flux[k] / (rest.free + prepared.cosine @ both)
+    dark = predicted(reach, both)[0] - reach.visible[:, k, None] * step
+    values = [part.mean(-1) for part in (blocks.ratio[index], dark, dark + step)]
+    sigma = np.sqrt((blocks.sigma[index] ** 2).sum(-1)) / 3
+    return fit_edge(
+        blocks.points[index], blocks.size[index], values[0], sigma, values[1], values[2], asked[k].direction,
+        asked[k].half_angle, seen.ball,
+    )  # fmt: skip
+
+
+def narrowed(out: np.ndarray, spread: np.ndarray, light: Light, edge: Edge | None) -> Light:
+    """The lamp as the disc that its shadow's edge gives, if sharper than its picture, which becomes its surroundings.
+
+    The edge must say so by twice its sigma, and the disc must lie where the lamp was clipped.
+    """
+    if edge is None or edge.half_angle + 2 * edge.sigma > NARROWER * light.half_angle:
+        return light
+    texels, share = disc_texels(edge.direction, max(edge.half_angle, SUN_HALF_ANGLE), len(out))
+    if not np.isin(texels, light.texels).all():
+        return light
+    out.reshape(-1, 3)[light.texels] = light.around
+    spread.reshape(-1, 3)[light.texels] = light.around**2
+    return replace(light, texels=texels, direction=edge.direction, shape=np.repeat(share[:, None], 3, 1))
 
 
 def _chosen(seen: Witness, found: list[Light], known: list[Light]) -> tuple[np.ndarray, np.ndarray] | None:
