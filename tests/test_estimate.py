@@ -138,9 +138,11 @@ def test_what_gets_no_more_than_a_glance_does_not_change() -> None:
     Five standard errors of the 256 samples are allowed. A frame nine times as large has no more to look at.
     """
     pilot, large = wide(1), wide(3)
-    all_cells = trace(difference_block, pilot.worlds, pilot.rays, 256, 4, 9, CELL)
+    camera = Camera(width=320, height=240, fx=600.0, fy=600.0, cx=160, cy=120)
+    rays = LensRays(camera, looking_down())[pilot.index]
+    all_cells = trace(difference_block, pilot.worlds, rays, 256, 4, 9, CELL)
     change, noise = all_cells.lost + all_cells.gained, np.sqrt(all_cells.change_variance)
-    near = near_objects(pilot.worlds, pilot.rays)
+    near = near_objects(pilot.worlds, rays)
     assert 0.01 < near.mean() < 0.3
     assert near[all_cells.alpha > 0].all()
     assert (all_cells.alpha > 0).sum() > 10

@@ -32,6 +32,7 @@ from pipeline.transport.passes import Halves, refine
 from pipeline.transport.region import (
     BLUR_NOISE,
     CELL,
+    GLANCE,
     WHOLE,
     Limits,
     Region,
@@ -59,8 +60,9 @@ STRATEGIES: dict[str, Strategy] = {"difference": difference_block, "reference": 
 PILOT_SHARE = 8  # samples of a cell over samples of a pixel: a cell stands for 64 pixels
 FIRST_PILOT = 2  # likewise, before the first picture
 LEAST_PILOT, MOST_PILOT = 16, 512  # samples of a cell before the first picture
+FEW_NOISY = 0.02  # of the cells
 CALM = 0.25  # of the tolerance of interpolation: noise of the pilot that need not be less
-GLANCE = 2  # samples of every cell; as many as the first pass takes, so that kernels are compiled once
+GLANCE_SAMPLES = 2  # of a square; as many as the first pass takes, so that kernels are compiled once
 GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
@@ -211,10 +213,9 @@ def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda w
 
 @dataclass(frozen=True, eq=False)
 class Pilot:
-    """What is known of the cells before any pixel is traced: those that are ``glanced`` at have `GLANCE` samples."""
+    """What is known of the cells before any pixel is traced; of those ``glanced`` at, what their square told."""
 
     worlds: Worlds
-    rays: Rays  # of the cells
     samples: Samples  # thrown light in it
     model: np.ndarray  # (cells, 3) expected LS_noobj
     thrown: np.ndarray  # (cells, 3) what light tracing finds
@@ -224,11 +225,15 @@ class Pilot:
     tolerance: float  # relative to LS_noobj, see `Limits`
 
     def too_noisy(self, region: Region) -> np.ndarray:
-        """Indices of the cells that stand for their pixels, and are noisier than a quarter of what is tolerated."""
+        """Indices of the cells that stand for their pixels, and are noisier than a quarter of what is tolerated.
+
+        None where they are fewer than `FEW_NOISY` of those that stand: not worth another pass.
+        """
         stands = (region.weight.ravel()[self.index] > 0) & ~region.traced.ravel()[self.index] & ~self.glanced
         known = stands & (self.model > 0).all(1)
         relative = self.samples.change_variance[known] / self.model[known] ** 2
-        return np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > CALM * self.tolerance]
+        noisy = np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > CALM * self.tolerance]
+        return noisy if len(noisy) > FEW_NOISY * stands.sum() else noisy[:0]
 
 
 def settled(canvas: Canvas, progress: Callable[[float], None]) -> Canvas:
@@ -241,7 +246,8 @@ def settled(canvas: Canvas, progress: Callable[[float], None]) -> Canvas:
     if pilot is None or rest <= 0 or not effort.adaptive or not len(cells := pilot.too_noisy(region)):
         return canvas
     seed = effort.stream + REFINED
-    more = trace(difference_block, pilot.worlds, pilot.rays[cells], rest, effort.depth, seed, CELL, progress)
+    rays = canvas.rays[pilot.index[cells]]
+    more = trace(difference_block, pilot.worlds, rays, rest, effort.depth, seed, CELL, progress)
     samples = pilot.samples.placed(cells, replace(more, gained=more.gained + pilot.thrown[cells]))
     found = of_cells(samples, pilot.model, pilot.grid, pilot.glanced)
     lost, gained, variance = in_pixels(found, canvas.shape, canvas.window)
@@ -265,32 +271,35 @@ def looked(
 ) -> Pilot:
     """A glance at every cell, and the pilot's samples where `worth_a_look` asks for them; arguments of `prepare`."""
     index, grid = cell_pixels(*shape)
-    cells = rays[index]
+    squares, coarse = cell_pixels(*shape, GLANCE * CELL)
+    square = (np.arange(grid[0])[:, None] // GLANCE * coarse[1] + np.arange(grid[1]) // GLANCE).ravel()  # of each cell
     bounces = light_by_cell(worlds, film, grid, effort) if film is not None else np.zeros((len(index), 3))
 
-    def traced(which: np.ndarray, samples: int, seed: int) -> Samples:
-        found = trace(
-            difference_block, worlds, cells[which], samples, effort.depth, effort.stream + seed, CELL, progress
-        )
-        return replace(found, gained=found.gained + bounces[which])
+    def traced(seen: Rays, samples: int, seed: int, side: int) -> Samples:
+        return trace(difference_block, worlds, seen, samples, effort.depth, effort.stream + seed, side, progress)
 
     closed = worlds.convex and worlds.diffuse
-    glance = traced(np.arange(len(index)), GLANCE, GLANCED)
-    cell_light = (
-        np.broadcast_to(light, (len(index), 3)) if closed else received(worlds, cells, grid, GLANCE, effort, CELL)
-    )
-    near = near_objects(worlds, cells)
+    seen = rays[squares]
+    glance = traced(seen, GLANCE_SAMPLES, GLANCED, GLANCE * CELL)[square]
+    glance = replace(glance, gained=glance.gained + bounces)
+    if closed:
+        cell_light = np.broadcast_to(light, (len(index), 3))
+    else:
+        cell_light = received(worlds, seen, coarse, GLANCE_SAMPLES, effort, GLANCE * CELL)[square]
+    near = near_objects(worlds, seen, GLANCE * CELL)[square]
     wanted = worth_a_look(glance, glance.albedo * cell_light / np.pi, grid, limits, near)
-    some = np.flatnonzero(wanted)
-    samples = glance.replaced(some, traced(some, pilot_samples(effort), 1)) if len(some) else glance
+    some, samples = np.flatnonzero(wanted), glance
+    if len(some):
+        found = traced(rays[index[some]], pilot_samples(effort), 1, CELL)
+        samples = glance.replaced(some, replace(found, gained=found.gained + bounces[some]))
     if not closed and len(some):
         part = np.ix_(*(np.arange(there.min(), there.max() + 1) for there in np.nonzero(wanted.reshape(grid))))
         inside = np.arange(len(index)).reshape(grid)[part]
         cell_light[inside.ravel()] = received(
-            worlds, cells[inside.ravel()], inside.shape, pilot_samples(effort), effort, CELL
+            worlds, rays[index[inside.ravel()]], inside.shape, pilot_samples(effort), effort, CELL
         )
     model = samples.albedo * cell_light / np.pi
-    return Pilot(worlds, cells, samples, model, bounces, ~wanted, grid, index, limits.tolerance)
+    return Pilot(worlds, samples, model, bounces, ~wanted, grid, index, limits.tolerance)
 
 
 def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> np.ndarray:

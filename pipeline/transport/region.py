@@ -3,8 +3,8 @@
 A pilot estimates the change on cells of `CELL` pixels. Cells below the threshold are left to the plate. Where the
 change, relative to LS_noobj, bends so little from cell to cell that linear interpolation errs by less than the
 tolerance, the pilot itself is the answer (soft shadows far from the object are smooth); elsewhere every pixel is
-traced. The pilot itself looks twice: a glance of two samples at every cell, and the whole only where blocks of 16 cells
-say that something changes or bounding spheres that it may, so that a large photograph costs what its changed part does.
+traced. The pilot itself looks twice: a glance at squares of four cells, and the whole only where blocks of 16 cells say
+that something changes or bounding spheres that it may, so that a large photograph costs what its changed part does.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import Rays, Samples
 
 CELL = 8  # px
+GLANCE = 2  # cells, side of the squares that a glance looks at
 BLOCK = 4  # cells, side of the blocks that a glance is judged on
 BLUR = 0.8  # cells: less noise for a bias of a third of the second difference, which the tolerance bounds
 BLUR_NOISE = 1 / (4 * np.pi * BLUR**2)  # variance after that blur over the variance before
@@ -59,21 +60,21 @@ class Region:
         return Region(**{name: values[window] for name, values in vars(self).items()})
 
 
-def cell_pixels(height: int, width: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Flat index of the pixel in the middle of every cell, and the grid's size (rows, columns)."""
-    rows = np.minimum(np.arange(CELL // 2, height + CELL // 2, CELL), height - 1)
-    columns = np.minimum(np.arange(CELL // 2, width + CELL // 2, CELL), width - 1)
+def cell_pixels(height: int, width: int, side: int = CELL) -> tuple[np.ndarray, tuple[int, int]]:
+    """Flat index of the pixel in the middle of every cell of ``side`` px, and the grid's size (rows, columns)."""
+    rows = np.minimum(np.arange(side // 2, height + side // 2, side), height - 1)
+    columns = np.minimum(np.arange(side // 2, width + side // 2, side), width - 1)
     return (rows[:, None] * width + columns).ravel(), (len(rows), len(columns))
 
 
-def near_objects(worlds: Worlds, rays: Rays) -> np.ndarray:
-    """(N,) bool: cells that may show an object, or on the plane the shadow of one in an emitter's light.
+def near_objects(worlds: Worlds, rays: Rays, side: int = CELL) -> np.ndarray:
+    """(N,) bool: cells of ``side`` px that may show an object, or on the plane the shadow of one in an emitter's light.
 
     By the objects' bounding spheres, with a cell's width around them: what is too thin for few samples is in there.
     """
     length = np.linalg.norm(rays.centre, axis=1)
     unit = rays.centre / length[:, None]
-    width = CELL * np.maximum(*(np.linalg.norm(by, axis=1) for by in (rays.by_x, rays.by_y))) / length  # [rad]
+    width = side * np.maximum(*(np.linalg.norm(by, axis=1) for by in (rays.by_x, rays.by_y))) / length  # [rad]
     toward = unit @ worlds.plane.normal
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (worlds.plane.offset_m - rays.origin @ worlds.plane.normal) / toward
@@ -204,7 +205,7 @@ def of_cells(
     if glanced is not None and glanced.any():
         far = glanced.reshape(*grid, 1)
         lost, gained = (np.where(far, over_blocks(block_means(values), grid), values) for values in (lost, gained))
-        variance = np.where(far, over_blocks(block_means(variance), grid) / BLOCK**2, variance)
+        variance = np.where(far, over_blocks(block_means(variance), grid) / (BLOCK / GLANCE) ** 2, variance)
     lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
     return lost, gained, variance
 
