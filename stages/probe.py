@@ -53,7 +53,8 @@ def compute(
     rgb = filling.fill(rgb, known)
     variance = filling.filled_variance(rgb, variance, known, gap)
     over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - laid)
-    lamps = clipped.recover(rgb, variance, over, clipped.witness(shots, observed))
+    seen_lamps = clipped.witness(shots, observed) if over.any() else clipped.Witness()
+    lamps = clipped.recover(rgb, variance, over, seen_lamps)
     rgb, variance = lamps.rgb, lamps.variance
     if observed.smooth_only:
         rgb, variance = smooth.reduced(rgb, variance)

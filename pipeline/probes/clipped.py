@@ -45,6 +45,12 @@ LEVEL = np.diag([1.0, 0.0, 1.0])  # the ball stands on the plane
 DARKER, PATCH = 0.05, 25  # a patch of so many blocks this much darker than predicted: a lamp that the map lacks
 
 
+NOTHING = {
+    "term": "flux of clipped lamps", "modelled": False, "because": "nothing is clipped in every frame",
+    "could_cost": "nothing",
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Witness:
     """What may answer to the fluxes: blocks of the plane around a ball, or surfaces of known albedo; either or both.
@@ -85,7 +91,8 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     found = find_lights(rgb, clipped)
     if not found:
         nowhere = np.zeros(clipped.shape)
-        return Recovered(rgb, variance, clipped, nowhere, {"clipped_lights": [], **_bounds(rgb, clipped, nowhere)})
+        numbers = {"clipped_lights": [], **_bounds(rgb, clipped, nowhere)}
+        return Recovered(rgb, variance, clipped, nowhere, numbers, evidence=[NOTHING])
     asked, refused = _asked(found)
     verdicts = dict(refused)
     rest = setting(rgb, np.where(held_by(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
