@@ -78,7 +78,8 @@ def measure(views: list[Pairs], tint: np.ndarray | None = None) -> Measured | No
     """Reflectance from the pairs of all views; None when too little of the plane is seen both ways.
 
     ``tint`` (3,) of a known metal replaces the ladder. Standard uncertainties are those of blocks (sectors about the
-    foot, near and far, of each view), so what neighbouring pixels share is not counted twice.
+    foot, near and far, of each view), so what neighbouring pixels share is not counted twice. Any surface that is seen
+    both ways can be added as pairs of its own: a card, a wall.
     """
     whole = _joined(views)
     block = plane_blocks(views)
