@@ -120,6 +120,10 @@ def test_room_is_used_beyond_the_budget_only(maps):
         true, rel=0.15
     )  # from the probe's map, on 64 rows; measured 0.1
     assert single.numbers["near_irradiance_error_left"] == 0
+    around = near_field.assess(at_probe, PROBE, [OBJECT, 2 * PROBE * [0, 1, 0] - OBJECT * [1, -1, 1]], ROOM, 0.02)
+    assert around.target is None
+    assert "no one place serves" in around.evidence["because"]
+    assert around.warnings
     close = near_field.assess(at_probe, PROBE, [PROBE + ALONG / 40], ROOM, 0.02)
     assert close.target is None
     assert not close.evidence["modelled"]

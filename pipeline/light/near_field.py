@@ -23,6 +23,7 @@ from pipeline.light.environment import AXES, irradiance, resize_environment
 
 PREDICTION_ROWS = 64  # rows of the map on which errors are predicted
 ASSUMED_M = (1.0, 2.0, 4.0)  # distances for which the error is stated when none is known
+WORTH = 0.75  # of the error: what is left at the centroid must be less, or nothing is moved
 SPLIT = 3  # samples per texel and axis; more where the new place looks at the old map from afar
 
 VALID, MEASURED = "insitu:valid_at_m", "insitu:measured_at_m"  # attributes of the map
@@ -128,8 +129,8 @@ def assess(
 ) -> Assessment:
     """Error of the map of ``source`` (3,) at the ``objects`` [(3,)], and whether it exceeds the ``budget``.
 
-    With a room the error is predicted, and cured at the objects' centroid when it is too large. Without, it is stated
-    for the farthest object and walls all around at 1, 2 and 4 m.
+    With a room the error is predicted, and cured at the objects' centroid when it is too large and that helps. Without,
+    it is stated for the farthest object and walls all around at 1, 2 and 4 m.
     """
     if not objects:
         return Assessment(None, {}, [], _reason(False, "no objects are placed", "nothing"))
@@ -159,6 +160,12 @@ def assess(
         return Assessment(None, numbers, [], _reason(False, because, f"{error:.2%} of irradiance"))
     left = max(irradiance_error(rgb, room.depth, source, target, place) for place in objects)
     numbers["near_irradiance_error_left"] = left
+    if left > WORTH * error:
+        because += f"; {left:.2%} would be left at their centroid: they stand around the probe, no one place serves all"
+        warning = (
+            f"near field: the light at the objects differs by {error:.1%} from that at the probe, on every side of it"
+        )
+        return Assessment(None, numbers, [warning], _reason(False, because, f"{error:.2%} of irradiance"))
     cost = f"{error:.2%} of irradiance; {left:.2%} is left between the objects, and the error of the room's measures"
     return Assessment(target, numbers, [], _reason(True, because, cost))
 

@@ -164,7 +164,7 @@ def disagreement_reason(figures: dict[str, float], views: int) -> dict[str, Any]
         if views > 1
         else "one view only: nothing to compare",
         "could_cost": "variance too small by up to "
-        f"{figures['disagreement_worst'] ** 2:.0f} where near things, clouds or people moved",
+        f"{figures['disagreement_worst'] ** 2:.0f} times where near things, clouds or people moved",
     }
 
 
