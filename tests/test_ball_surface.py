@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -31,6 +31,8 @@ from pipeline.probes.kinds import KINDS
 from pipeline.probes.mirror_ball import MirrorBall
 from pipeline.probes.observation import Grid, Observation, Shots, ViewMap
 from pipeline.probes.sphere_fit import radius_in_pixels
+from pipeline.run.probe_facts import MirrorBallFacts
+from pipeline.run.strict import Metal
 from pipeline.transport.conductors import GRAZING, REFLECTANCE, preset, reflectance_at
 from pipeline.types import Camera, Raster, View
 from stages import knobs, probe
@@ -172,6 +174,21 @@ def test_hidden_and_clipped_points_are_left_out():
     assert (along > RADIUS).all()  # no point is seen through the ball
 
 
+def test_nothing_to_compare_is_no_evidence():
+    blind = channels(np.ones((CAMERA.height, CAMERA.width, 3)))
+    blind[..., 6] = 0
+    sight = dataclasses.replace(sights(False)["a"], picture=blind)
+    found = plane_pairs(sight)
+    assert len(found) == 0
+    assert measure([found]) is None
+    assert dents(sight, 100.0, np.eye(3) * 1e-8, patch_shifts(found)) is None
+    empty, figures, _ = find_dirt(
+        {"a": sight}, {"a": found}, None, Surface(TRUE, np.zeros(3)), 0.97, {"a": (CAMERA.height, CAMERA.width)}, []
+    )
+    assert not empty
+    assert not figures
+
+
 # ---- angle dependence ----------------------------------------------------------------------------------------------
 
 
@@ -188,6 +205,12 @@ def test_without_a_tint_all_angles_are_the_same():
     assert Surface(TRUE, np.zeros(3)).at(np.array([[0.0, 0.9], [np.nan, 1.0]])) == pytest.approx(
         np.broadcast_to(TRUE, (2, 2, 3))
     )
+
+
+def test_the_manifest_knows_the_metals():
+    assert set(get_args(Metal)) == set(REFLECTANCE)
+    assert MirrorBallFacts(diameter_m=0.1).reflectance is None
+    assert MirrorBallFacts(diameter_m=0.1, material="silver").material == "silver"
 
 
 # ---- what is used --------------------------------------------------------------------------------------------------

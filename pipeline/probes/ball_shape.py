@@ -4,6 +4,11 @@ The plane is the test chart: its texture is known from the direct view, so the b
 pixel by pixel, and where a patch of the real picture lies beside its prediction the surface is tilted. What stands out
 of the patches' own noise and of the fitted centre's covariance is the ball's shape. Two views bound that besides: what
 they disagree on above the horizon is dents, parallax and noise together.
+
+The outline is no witness: a mirror's rim continues its background, so single stretches of it are known to 0.2 to 0.9 px
+only. Harmonics 2 to 6 of perfect balls of 80 to 106 px, ray-traced and captured, came out at 0.2 to 0.9 px rms, by
+steepest slopes, by a path through all of them, and by a model of the light on both sides: 1 to 6 degrees of direction,
+where the mirrored plane shows half a degree.
 """
 
 from __future__ import annotations
