@@ -21,7 +21,6 @@ from pipeline.probes.reflection import incidence, solid_angle_gain
 from pipeline.types import Camera
 
 TABLE = 1 << 16  # steps of the cosine: 1e-10 in the table's middle, 1e-5 rad at 1 degree from its end
-BEYOND = 0.3  # of the radius: how far outside the silhouette blind directions are put
 RAY_STEP_PX = 16  # grid on which the lens is inverted; between, rays are linear to 1e-6 of their angle
 BAND_TEXELS, BAND_PIXELS = 1 << 14, 1 << 17  # at once, per thread: their temporaries stay in the cache
 WORKERS = min(8, os.cpu_count() or 1)
@@ -52,6 +51,11 @@ class Mirror:
         return self.radius / float(np.linalg.norm(self.centre))
 
     @property
+    def radius_px(self) -> float:
+        """Radius of the silhouette were it in the middle of the picture; a pixel there mirrors about 2 / radius rad."""
+        return max(self.camera.fx, self.camera.fy) * float(np.tan(np.arcsin(self.ratio)))
+
+    @property
     def axis(self) -> np.ndarray:
         """(3,) unit direction from the camera to the centre, camera frame."""
         return self.centre / np.linalg.norm(self.centre)
@@ -61,6 +65,15 @@ class Mirror:
         camera = self.camera
         scaled = {name: factor * getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         return replace(self, camera=camera.model_copy(update=scaled))
+
+    @property
+    def ends(self) -> np.ndarray:
+        """(2, 2) pixels x, y of the highest and the lowest point of the silhouette."""
+        first = np.linalg.svd(self.axis[None])[2][1]
+        azimuth = np.linspace(0, 2 * np.pi, 720)[:, None]
+        spokes = np.cos(azimuth) * first + np.sin(azimuth) * np.cross(self.axis, first)
+        px = project(self.camera, np.sqrt(1 - self.ratio**2) * self.axis + self.ratio * spokes)
+        return px[[np.nanargmin(px[:, 1]), np.nanargmax(px[:, 1])]]
 
     @functools.cached_property
     def table(self) -> np.ndarray:
@@ -75,6 +88,19 @@ class Mirror:
         limit = self.ratio / (2 - self.ratio)  # of sin rho / sin theta, towards the camera
         along = np.where(sine_theta > 1e-6, sine / np.maximum(sine_theta, 1e-6), np.where(theta < 1, limit, 0))
         return np.stack([along, np.sqrt(1 - sine * sine) + np.cos(theta) * along, angle], -1)
+
+    @functools.cached_property
+    def lens_nodes(self) -> tuple[list[np.ndarray], tuple[float, float], float]:
+        """The inverse of the lens on a grid between the outermost pixels' centres (h', w', 3), its steps [px], scale.
+
+        X/Z and Y/Z less the centre's, and the area of Z = 1 that a pixel covers, over ``scale``.
+        """
+        camera, axis = self.camera, self.axis
+        x, y = (np.linspace(0.5, n - 0.5, n // RAY_STEP_PX + 2) for n in (camera.width, camera.height))
+        xn, dxn = rays_through(camera, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+        area = np.abs(np.linalg.det(dxn))
+        nodes = np.concatenate([xn - axis[:2] / axis[2], area[:, None] / area.mean()], 1)
+        return planes(nodes.reshape(len(y), len(x), 3)), (x[1] - x[0], y[1] - y[0]), float(area.mean())
 
     def looked_up(self, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The three columns of `table`, linear between its rows."""
@@ -99,8 +125,7 @@ def pixels_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels x, y (N, M) that show the lat-long positions ``row`` (N,), ``column`` (M,) in texels; and the incidence.
 
-    Blind directions (incidence over pi/2) are put outside the silhouette, at their own azimuth: the map stays
-    continuous, and nothing of the ball is there.
+    Blind directions (incidence over pi/2) are put on the silhouette, at their own azimuth.
     """
     w = directions(row, column, height, width, mirror.rotation)
     axis = mirror.axis
@@ -114,15 +139,12 @@ def pixels_of(
             xy *= np.minimum(1, fold / np.maximum(np.hypot(xy[..., 0], xy[..., 1]), 1e-12))[..., None]
         xy = distort(camera.distortion, xy)
     x, y = xy[..., 0] * camera.fx + camera.cx, xy[..., 1] * camera.fy + camera.cy
-    blind = angle > np.pi / 2
-    if blind.any():
-        middle = project(camera, mirror.centre[None])[0]
-        x, y = (p + BEYOND * blind * (p - m) for p, m in zip((x, y), middle, strict=True))
     return x, y, angle
 
 
 def corners(mirror: Mirror, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`pixels_of` the corners of all texels: x, y, incidence (H + 1, W + 1); the last column repeats the first."""
+    _ = mirror.table  # once, before the threads ask for it
     with ThreadPoolExecutor(WORKERS) as pool:
         work = (np.arange(b.start, b.stop) for b in bands(height + 1, BAND_TEXELS // width))
         parts = list(pool.map(lambda lines: pixels_of(mirror, lines, np.arange(width), height, width), work))
@@ -137,15 +159,11 @@ def pixel_solid_angles(mirror: Mirror, rows: slice) -> np.ndarray:
     The pixel's own solid angle, from the lens, times the gain of the reflection, both at its centre. The rule of the
     centre is off by 0.03 / d^2 of the value at d pixels under the silhouette, where the gain grows as d^-1/2.
     """
-    camera, axis = mirror.camera, mirror.axis
-    node_x, node_y = (np.linspace(0.5, n - 0.5, n // RAY_STEP_PX + 2) for n in (camera.width, camera.height))
-    xn, dxn = rays_through(camera, np.stack(np.meshgrid(node_x, node_y), -1).reshape(-1, 2))
-    area = np.abs(np.linalg.det(dxn))
-    nodes = np.concatenate([xn - axis[:2] / axis[2], area[:, None] / area.mean()], 1)
-    nodes = nodes.reshape(len(node_y), len(node_x), 3)
-    x = np.arange(camera.width) / (node_x[1] - node_x[0]) + 0.5
-    y = np.arange(rows.start, rows.stop) / (node_y[1] - node_y[0]) + 0.5
-    fine = bilinear(planes(nodes), *np.broadcast_arrays(x[None], y[:, None]))
+    axis = mirror.axis
+    nodes, (step_x, step_y), scale = mirror.lens_nodes
+    x = np.arange(mirror.camera.width) / step_x + 0.5
+    y = np.arange(rows.start, rows.stop) / step_y + 0.5
+    fine = bilinear(nodes, *np.broadcast_arrays(x[None], y[:, None]))
     dx, dy = fine[..., 0], fine[..., 1]
     a = axis.astype(np.float32)
     square = 1 + (dx + a[0] / a[2]) ** 2 + (dy + a[1] / a[2]) ** 2
@@ -153,7 +171,7 @@ def pixel_solid_angles(mirror: Mirror, rows: slice) -> np.ndarray:
     sine2 = cross / (square * np.float32(mirror.ratio**2))
     inside = sine2 <= mirror.rim**2
     gain = solid_angle_gain(np.where(inside, sine2, 0), mirror.ratio)
-    return np.where(inside, gain * fine[..., 2] * np.float32(area.mean()) / (square * np.sqrt(square)), 0)
+    return np.where(inside, gain * fine[..., 2] * np.float32(scale) / (square * np.sqrt(square)), 0)
 
 
 def texel_directions(
@@ -174,6 +192,8 @@ def texel_directions(
     world = mirror.rotation.T @ centre_covariance @ mirror.rotation
     axis = mirror.rotation.T @ mirror.axis
 
+    _ = mirror.table
+
     def fill(block: slice) -> None:
         row = np.arange(block.start, block.stop) + 0.5
         sine[block], covariance[block] = _band_directions(mirror, axis, world, turn_covariance, row, height, width)
@@ -181,6 +201,10 @@ def texel_directions(
     with ThreadPoolExecutor(WORKERS) as pool:
         list(pool.map(fill, bands(height, BAND_TEXELS // width)))
     return sine, covariance
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def _band_directions(
@@ -199,21 +223,21 @@ def _band_directions(
     into = np.maximum(np.cos(angle), 1e-3)
     rho = np.arcsin(mirror.ratio * np.sin(np.minimum(angle, np.pi / 2)))
     across = np.cross(axis, w)
-    length = np.maximum(np.linalg.norm(across, axis=-1), 1e-9)[..., None]
+    length = np.maximum(np.sqrt(_dot(across, across)), 1e-9)[..., None]
     across /= length
     spoke = (w + cosine[..., None] * axis) / length
     ahead = np.cos(rho)[..., None] * spoke - np.sin(rho)[..., None] * axis
     scale = 4 / mirror.radius**2
     turned = ahead @ centre
-    radial = scale * (turned * ahead).sum(-1) / into**2
-    mixed = scale * (turned * across).sum(-1)
-    tangential = scale * ((across @ centre) * across).sum(-1) * into**2
+    radial = scale * _dot(turned, ahead) / into**2
+    mixed = scale * _dot(turned, across)
+    tangential = scale * _dot(across @ centre, across) * into**2
     p, q = (((down @ axis) / length[..., 0]), (east @ axis) / length[..., 0])  # of the direction of growing theta
-    first, second, turned = east @ turn, down @ turn, (down @ turn * east).sum(-1)
+    first, second, turned = east @ turn, down @ turn, _dot(down @ turn, east)
     found = np.stack(
         [
-            p * p * radial - 2 * p * q * mixed + q * q * tangential + (first * east).sum(-1),
-            q * q * radial + 2 * p * q * mixed + p * p * tangential + (second * down).sum(-1),
+            p * p * radial - 2 * p * q * mixed + q * q * tangential + _dot(first, east),
+            q * q * radial + 2 * p * q * mixed + p * p * tangential + _dot(second, down),
             p * q * (radial - tangential) + (p * p - q * q) * mixed - turned,
         ],
         -1,

@@ -13,7 +13,7 @@ for the whole map and is not in here: `Observation.scale_sigma`.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from pipeline.conventions import latlong_solid_angles
 from pipeline.light.sampling import enlarged
 from pipeline.probes.area_sums import area_sums
 from pipeline.probes.mirror_geometry import BAND_TEXELS, WORKERS, Mirror, bands, corners
+from pipeline.probes.reflection import incidence
 
 FINE_PX = 1.0  # pixels per texel along a side, face on, from which on the ball is not enlarged
 MOST = 8  # times that it is enlarged: blocks of a ball that is coarser still are no worse than its blur
+LEAST_WIDTH = 1024  # of the grid whose texels are polygons: coarser ones are sums, as their edges are curved
 KERNEL_FIT = 0.94  # of the Gaussian that stands for texel and pixel below: within 6 % of boxes and tents of 0 to 5 px
 BOX, TENT = 1 / 12, 1 / 6  # variance [px^2] along an axis of a pixel, and of one that was enlarged
 
@@ -45,8 +47,7 @@ class Unwrapped:
 
 def enlargement(mirror: Mirror, width: int) -> int:
     """How many times the picture is enlarged: until a pixel in the ball's middle, 2 / radius rad, is a texel's size."""
-    radius_px = max(mirror.camera.fx, mirror.camera.fy) * np.tan(np.arcsin(mirror.ratio))
-    return int(np.clip(np.ceil(FINE_PX * width / (np.pi * radius_px)), 1, MOST))
+    return int(np.clip(np.ceil(FINE_PX * width / (np.pi * mirror.radius_px)), 1, MOST))
 
 
 def unwrap(
@@ -58,14 +59,23 @@ def unwrap(
     beyond the mirror's rim are left out. ``factor`` overrides `enlargement`.
     """
     factor = enlargement(mirror, width) if factor is None else factor
-    edges = corners(mirror, height, width)
-    pixels, spread = footprint(edges[0], edges[1], BOX if factor == 1 else TENT)
+    gap = np.hypot(
+        np.pi / height, 2 * np.pi / width
+    )  # a texel's diagonal stays unseen: its corners must not surround it
+    widest = np.sin(np.minimum(incidence(np.array(np.pi - gap), mirror.ratio), np.pi / 2))
+    mirror = replace(mirror, rim=min(mirror.rim, float(widest)))
+    parts = -(-LEAST_WIDTH // width)
+    edges = corners(mirror, parts * height, parts * width)
+    coarse = slice(None, None, parts)
+    pixels, spread = footprint(edges[0][coarse, coarse], edges[1][coarse, coarse], BOX if factor == 1 else TENT)
     layers = [valid, *channels]
     if factor > 1:
         layers = [enlarged(layer, factor) for layer in layers]
         mirror = mirror.enlarged(factor)
         edges = (edges[0] * factor, edges[1] * factor, edges[2])
     sums = area_sums(layers, mirror, edges)
+    if parts > 1:
+        sums = sums.reshape(height, parts, width, parts, -1).sum((1, 3))
     whole = latlong_solid_angles(height, width).astype(np.float32)
     weight, values = sums[..., 0], sums[..., 1:]
     weight[weight < 1e-5 * whole] = 0  # slivers: rounding
@@ -80,12 +90,26 @@ def footprint(x: np.ndarray, y: np.ndarray, kernel: float) -> tuple[np.ndarray, 
     From corners (H + 1, W + 1). Texel and pixel, convolved, are taken as the Gaussian of the same second moments, whose
     square integrates to ``1 / (4 pi sqrt(det))``.
     """
+    height, width = x.shape[0] - 1, x.shape[1] - 1
+    area, spread = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+
+    def fill(block: slice) -> None:
+        lines = slice(block.start, block.stop + 1)
+        area[block], spread[block] = _footprint(x[lines], y[lines], kernel)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        list(pool.map(fill, bands(height, BAND_TEXELS // width)))
+    return area, spread
+
+
+def _footprint(x: np.ndarray, y: np.ndarray, kernel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Some rows of `footprint`."""
     ux, uy = (0.5 * (np.diff(p[1:], axis=1) + np.diff(p[:-1], axis=1)) for p in (x, y))
     vx, vy = (0.5 * (np.diff(p[:, 1:], axis=0) + np.diff(p[:, :-1], axis=0)) for p in (x, y))
     xx, yy, xy = ((a * b + c * d) / 12 for a, b, c, d in ((ux, ux, vx, vx), (uy, uy, vy, vy), (ux, uy, vx, vy)))
     determinant = (xx + kernel) * (yy + kernel) - xy * xy
     spread = KERNEL_FIT / (4 * np.pi * np.sqrt(determinant))
-    return np.abs(ux * vy - uy * vx).astype(np.float32), spread.astype(np.float32)
+    return np.abs(ux * vy - uy * vx), spread
 
 
 def displaced_variance(rgb: np.ndarray, direction: np.ndarray, coverage: np.ndarray) -> np.ndarray:
