@@ -146,7 +146,7 @@ def test_a_lamp_whose_shadow_the_ball_hides_is_named_not_fitted(scene, pictures)
     found, _, rgb, _ = case(scene, pictures, [0, 0, 0, 1.0])
     (row,) = found.numbers["clipped_lights"]
     assert row["lower_bound"]
-    assert row["why_not"] == "its shadow of the ball is not in the picture"
+    assert row["why_not"] == "the shadow that it casts of the ball is not in the picture"
     assert np.array_equal(found.rgb, rgb)
     assert "lower bound" in found.warnings[0]
     # It lights the plane beyond, by nobody knows how much, so a second lamp's share of the light is unknown too.
@@ -169,6 +169,24 @@ def test_a_lamp_that_the_map_lacks_is_noticed(scene, pictures):
     (row,) = found.numbers["clipped_lights"]
     assert row["lower_bound"]
     assert "one is unseen" in row["why_not"]
+
+
+def test_a_clipped_window_leaves_the_others_open(scene, pictures):
+    """A patch of 25 degrees, clipped, has no shadow of its own: the plane's light is unknown, and so its shares."""
+    free = flux_scene.sky_irradiance(scene).mean()
+    fluxes = [free * COLOUR, *np.zeros((3, 3))]
+    rgb, over = flux_scene.true_map(scene, fluxes, CLIP)
+    window = latlong_directions(*over.shape) @ flux_scene.from_angles(40, -60) > np.cos(np.radians(25))
+    rgb[window], over[window] = CLIP, 1
+    plate, ball = pictures.at(fluxes)
+    rasters = [flux_scene.raster(one, np.inf, seed) for seed, one in enumerate((ball, plate))]
+    blocks = plane_blocks(*rasters, scene.camera, scene.world_from_camera, ball_fit(scene))
+    place = ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance)
+    found = clipped.recover(rgb, rgb**2, over, clipped.Witness(place, blocks))
+    whys = [row["why_not"] for row in found.numbers["clipped_lights"]]
+    assert "degrees wide" in whys[0]
+    assert "another clipped light" in whys[1]
+    assert np.array_equal(found.rgb, rgb)
 
 
 def test_without_a_tripod_view_the_bound_stays(scene, pictures):

@@ -28,6 +28,7 @@ from pipeline.probes.shadow_edge import SUN_HALF_ANGLE, Edge, disc_texels, fit_e
 WIDEST = np.radians(10.0)  # half angle; the shadow of a wider one is as soft as the sky's
 MOST = 6  # lamps solved for together
 KNOWN_SHARE = 0.003  # of the light: lamps that are not clipped and are kept apart from the smooth sky
+UNKNOWN = 0.01  # of the plane's light: clipped light without an answer that leaves those of others open
 LOWEST = 0.05  # cosine with the plane's normal below which a lamp hardly lights it
 SKY_ROWS = 128  # of the smooth map that is looked up
 TURNS, SETTLED = 6, 1e-3  # of fluxes and albedo by turns; change of the irradiance
@@ -97,6 +98,8 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     verdicts = dict(refused)
     rest = setting(rgb, np.where(held_by(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
     answers, numbers = _answers(seen, rest, [light for _, light in asked])
+    if vague := _vague(found, refused, rest):
+        answers = [replace(answer, refused=answer.refused or vague) for answer in answers]
     out, spread, recovered = np.array(rgb, float), np.array(variance, float), np.zeros(clipped.shape)
     rows: list[dict[str, Any]] = []
     for number, light in enumerate(found, 1):
@@ -154,6 +157,15 @@ def _asked(found: list[Light]) -> tuple[list[tuple[int, Light]], dict[int, str]]
     return asked, refused
 
 
+def _vague(found: list[Light], refused: dict[int, str], rest: Setting) -> str:
+    """Why no flux can be had from shares of the plane's light: a clipped light that is not asked for adds to it too."""
+    for number in refused:
+        light = found[number - 1]
+        if np.any(light.bound * max(light.direction[1], 0) > UNKNOWN * rest.free):
+            return "another clipped light, not told by its shadow, lights the plane by an unknown amount"
+    return ""
+
+
 def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Answer], dict[str, Any]]:
     """One answer for each lamp, and figures of the solution."""
     none = [Answer(light.bound, np.full(3, np.inf), np.inf, 0, seen.missing) for light in asked]
@@ -171,7 +183,7 @@ def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Ans
         )  # fmt: skip
         why = ""
         if dark < LEAST and not faced:
-            why = "its shadow of the ball is not in the picture"
+            why = "the shadow that it casts of the ball is not in the picture"
         elif worst > WORST_CONDITION:
             why = f"its share cannot be told from another lamp's (condition number {worst:.0f})"
         elif unseen:
