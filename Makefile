@@ -73,6 +73,13 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)
 
+bench-probe: $(READY)  ## measure the probe against truth and peers, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.probe $(BENCH)
+
+bench-skylibs-env:  ## skylibs for bench-probe, in .skylibs
+	@test -x .skylibs/bin/python || python3 -m venv --without-pip .skylibs
+	python3 -m pip --python .skylibs/bin/python install --quiet skylibs
+
 bench-cycles-env:  ## Blender's Cycles for bench-render, in .blender (Python 3.11, 1 GB)
 	@test -x .blender/bin/python || python3.11 -m venv --without-pip .blender
 	python3 -m pip --python .blender/bin/python install --quiet 'bpy==5.0.1' 'numpy<2'
@@ -88,4 +95,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: bench-render bench-cycles-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
