@@ -62,12 +62,12 @@ class GreyBall:
         view = smooth_view(rgb, covariance, grid)
         numbers: dict[str, Any] = {name: fit_numbers(ball, radius) for name, ball in found.items()}
         sigma = np.sqrt(np.einsum("cii->ci", covariance))
-        missed = np.abs(sh9_of_environment(rgb) - coefficients)
+        missed, mean = np.abs(sh9_of_environment(rgb) - coefficients), np.maximum(np.abs(coefficients[0]), 1e-300)
         numbers["harmonics"] = {
-            "pixels": len(normals), "sigma_over_mean": (sigma[1] / coefficients[0, 1]).tolist(),
-            "missed_over_mean": float((missed / coefficients[0]).max()),
+            "pixels": len(normals), "sigma_over_mean": (sigma[1] / mean[1]).tolist(),
+            "missed_over_mean": float((missed / mean).max()),
         }  # fmt: skip
-        if (missed > 3 * sigma.T + MISSED * coefficients[0]).any():
+        if (missed > 3 * sigma.T + MISSED * mean).any():
             warnings.append(
                 f"grey ball: no positive light over the plane that the plate shows gives the ball's shading (misses by "
                 f"{numbers['harmonics']['missed_over_mean']:.0%}); are exposures alike, is probe.albedo right?"
