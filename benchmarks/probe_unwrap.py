@@ -115,7 +115,7 @@ def sun_picture(mirror: Mirror, sun: np.ndarray) -> np.ndarray:
     """(h, w) photograph of the sun alone: means over pixels of about two million rays in all."""
     camera = mirror.camera
     picture = np.zeros((camera.height, camera.width), np.float32)
-    step = 4
+    step = 8 if camera.width > 1000 else 4
     y, x = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
     coarse, _ = traced(mirror, np.stack([x.ravel(), y.ravel()], -1) + 0.5 * step)
     best = np.nan_to_num(coarse @ sun, nan=-2).argmax()
@@ -254,22 +254,24 @@ def measured(mirror: Mirror, radius_px: float, pictures: dict[float, np.ndarray]
     }  # fmt: skip
 
 
-def rows(radii: tuple[float, ...] = (100, 200, 500, 1500), distances: tuple[float, ...] = (8, 1000)) -> list[dict]:
-    """Ours and the peers over radii and distances."""
+CELLS = ((100.0, 8.0), (200.0, 8.0), (500.0, 8.0), (1500.0, 8.0), (100.0, 1000.0), (500.0, 1000.0))
+
+
+def rows(cells: tuple[tuple[float, float], ...] = CELLS) -> list[dict]:
+    """Ours and the peers over cells of radius [px] and distance over radius."""
     found = []
-    for distance in distances:
-        for radius_px in radii:
-            mirror = ball(radius_px, distance)
-            base = sky_picture(mirror)
-            pictures = {0.0: base}
-            pictures |= {a: base + sun_picture(mirror, sun_direction(mirror, a)) for a in suns(mirror)}
-            runs: dict[str, Any] = {"ours": ours(None), "orthographic": orthographic}
-            if enlargement(mirror, WIDTH) > 1:
-                runs["ours, as photographed"] = ours(1)
-            if peer().exists():
-                runs["skylibs"] = skylibs
-            for name, run in runs.items():
-                found.append(measured(mirror, radius_px, pictures, name, run))
+    for radius_px, distance in cells:
+        mirror = ball(radius_px, distance)
+        base = sky_picture(mirror)
+        pictures = {0.0: base}
+        pictures |= {a: base + sun_picture(mirror, sun_direction(mirror, a)) for a in suns(mirror)}
+        runs: dict[str, Any] = {"ours": ours(None), "orthographic": orthographic}
+        if enlargement(mirror, WIDTH) > 1:
+            runs["ours, as photographed"] = ours(1)
+        if peer().exists():
+            runs["skylibs"] = skylibs
+        for name, run in runs.items():
+            found.append(measured(mirror, radius_px, pictures, name, run))
     return found
 
 

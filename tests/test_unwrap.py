@@ -121,7 +121,7 @@ LAMPS = {
 @pytest.mark.parametrize("radius_px", [60, 250])
 def test_lamps_of_one_pixel_keep_their_energy(distance_over_radius, radius_px):
     # Sums are conserved to rounding (next test). Means take a pixel's solid angle as even over the pixel and texels as
-    # polygons: 0.1 %, and the square of the slope s / (1 - s^2) / radius of the solid angle, 7 % per px at 0.9 of 60 px.
+    # polygons: 0.1 %, and the square of the solid angle's slope s / (1 - s^2) / radius, 7 % per px at 0.9 of 60 px.
     mirror = mirror_of(radius_px, distance_over_radius)
     base = np.full((mirror.camera.height, mirror.camera.width), 1e-3, np.float32)
     valid, tested = np.ones_like(base), 0

@@ -21,7 +21,8 @@ from pipeline.probes.reflection import incidence, solid_angle_gain
 from pipeline.types import Camera
 
 TABLE = 1 << 16  # steps of the cosine: 1e-10 in the table's middle, 1e-5 rad at 1 degree from its end
-RAY_STEP_PX = 16  # grid on which the lens is inverted; between, rays are linear to 1e-6 of their angle
+RAY_STEP_PX, RAY_STEP = 16, 0.02  # grid on which the lens is inverted, at most so many px and focal lengths: between,
+# rays are linear, off by 0.75 k1 r RAY_STEP^2, 1e-5 of strong lenses
 BAND_TEXELS, BAND_PIXELS = 1 << 14, 1 << 17  # at once, per thread: their temporaries stay in the cache
 WORKERS = min(8, os.cpu_count() or 1)
 
@@ -96,7 +97,8 @@ class Mirror:
         X/Z and Y/Z less the centre's, and the area of Z = 1 that a pixel covers, over ``scale``.
         """
         camera, axis = self.camera, self.axis
-        x, y = (np.linspace(0.5, n - 0.5, n // RAY_STEP_PX + 2) for n in (camera.width, camera.height))
+        step = int(np.clip(RAY_STEP * min(camera.fx, camera.fy), 1, RAY_STEP_PX))
+        x, y = (np.linspace(0.5, n - 0.5, n // step + 2) for n in (camera.width, camera.height))
         xn, dxn = rays_through(camera, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
         area = np.abs(np.linalg.det(dxn))
         nodes = np.concatenate([xn - axis[:2] / axis[2], area[:, None] / area.mean()], 1)
