@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.conventions import invert_rigid, transform_points
-from pipeline.probes import sphere_fit
+from pipeline.conventions import CLIPPED, HOT, invert_rigid, transform_points
+from pipeline.probes import seeds, sphere_fit
+from pipeline.probes.outline import Height, radius_in_pixels, silhouette
 from pipeline.probes.reflection import blind_half_angle
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
@@ -15,8 +17,13 @@ from pipeline.types import Camera, Raster, View
 MIN_DISTANCE_RATIO = 1.5  # D / R below which the ball fills the view
 FLAG_DISTANCE_RATIO, FLAG_RADIUS_PX, REFUSE_RADIUS_PX = 3.0, 40.0, 12.0
 MIN_VISIBLE = 0.7  # of the outline; less is refused, less than all is flagged
-MIN_MERIT = 0.5  # of an outline: on two captures balls had 0.52 to 0.85, empty tables with a board 0.38 to 0.49
+# Share of azimuths that see the outline, chance taken off: on two captures balls had 0.64 to 0.92, the best places of
+# empty tables with a board 0.36 (on the plane) and 0.56 (anywhere, 20 to 30 px).
+MIN_MERIT, MIN_MERIT_ANYWHERE = 0.58, 0.65
+MAX_RMS_PX = 1.0  # scatter of the rim over sectors: balls had 0.1 to 0.3, a false outline 1.5
+MIN_VISIBLE_ANYWHERE = 0.6
 INNER = (0.3, 0.6, 0.8)  # circles, as fractions of the outline, where a mirror shows something else than the table
+SOFT_PX = 2.5  # sigma of the rim's blur above which the ball is said to be out of focus
 MIN_CHANGE = 0.02  # median change of tone inside the outline between plate and ball, on a tripod
 STAND_SIGMA = 5e-3  # of the radius: how well ball and table touch, and the diameter is known
 
@@ -27,8 +34,10 @@ class Found:
 
     fit: sphere_fit.SphereFit
     free: sphere_fit.SphereFit
-    height: sphere_fit.Height
+    height: Height
     centre_world: np.ndarray
+    seed: str = "plane"  # or other_view, anywhere, click
+    on_plane: bool = True
 
 
 def find_ball(
@@ -39,36 +48,85 @@ def find_ball(
     view: View,
     radius: float,
     near: list[np.ndarray],
+    click_px: tuple[float, float] | None = None,
+    radius_sigma: float = 0.0,
 ) -> Found:
     """Find and fit the ball of one view; ``near`` are its centres in other views, world frame.
 
+    Seeds are tried in turn until a ball is seen: those of other views, the plane, anywhere in the picture (the pose is
+    off, or the ball does not stand on the plane), a click ``click_px`` (x, y) near its centre, pixel origin of
+    conventions. What the last two find is fitted without the plane. ``radius_sigma`` [m] is that of the radius.
     Raises CaptureError when there is no ball, or it cannot be used.
     """
-    height = height_prior(view, radius)
+    prior = height_prior(view, radius)
+    height = Height(prior.normal, prior.offset_m, float(np.hypot(prior.sigma_m, radius_sigma)))
     signals = signals_of(photograph, plate)
     camera_from_world = invert_rigid(view.world_from_camera)
-    seeds = [transform_points(camera_from_world, centre) for centre in near]
-    best = best_fit(signals, camera, radius, height, seeds)
-    if best is None or not is_ball(best[0]):
-        seeds = list(sphere_fit.search_on_plane(signals, camera, radius, height, 8 if plate is None else 4))
-        best = best_fit(signals, camera, radius, height, seeds)
-    if best is None or not is_ball(best[0]):
-        shown = "nothing like one" if best is None else f"an outline of merit {best[0].merit:.2f}"
+    ways: list[tuple[str, Height | None, Callable[[], Iterable[np.ndarray]]]] = [
+        ("other_view", height, lambda: [transform_points(camera_from_world, centre) for centre in near]),
+        ("plane", height, lambda: seeds.search_on_plane(signals, camera, radius, height, 8 if plate is None else 4)),
+        ("anywhere", None, lambda: seeds.search_anywhere(signals, camera, radius)),
+    ]
+    if click_px is not None:
+        ways.append(("click", None, lambda: seeds.search_anywhere(signals, camera, radius, 3, click_px)))
+    needed = {"anywhere": MIN_MERIT_ANYWHERE, "click": 0.5 * MIN_MERIT}
+    best, most = None, 0.0
+    for way, prior_height, places in ways:
+        pair = best_fit(signals, photograph, camera, radius, height, list(places()), prior_height is not None)
+        most = max(most, pair[0].merit if pair else 0.0)
+        if way == "anywhere" and pair is not None and pair[0].visible < MIN_VISIBLE_ANYWHERE:
+            continue
+        if pair is not None and pair[0].merit >= needed.get(way, MIN_MERIT):
+            best = (way, prior_height, pair)
+            break
+    if best is None:
         raise CaptureError(
-            f"{name}: no mirror ball of radius {radius * 1e3:.1f} mm on the plane: {shown}, needed {MIN_MERIT}; is it "
-            "in the frame, is probe.diameter_m right, is the view's pose right?"
+            f"{name}: no mirror ball of radius {radius * 1e3:.1f} mm: an outline seen from {most:.0%} of its azimuths, "
+            f"needed {MIN_MERIT:.0%}; is it in the frame, is probe.diameter_m right, is the view's pose right? Else "
+            "give click_px near its centre"
         )
-    fit, free = best
+    way, prior_height, (fit, free) = best
     refuse(name, fit, radius)
     if plate is not None and (change := change_at(signals[0], camera, fit.centre, radius, INNER)) < MIN_CHANGE:
         raise CaptureError(
             f"{name}: no mirror ball: the picture equals the plate to {change:.1%} where its outline would be, needed "
             f"{MIN_CHANGE:.0%}; is the view marked as tripod really the one with the ball?"
         )
-    return Found(fit, free, height, transform_points(view.world_from_camera, fit.centre))
+    centre_world = transform_points(view.world_from_camera, fit.centre)
+    return Found(fit, free, height, centre_world, way, prior_height is not None)
 
 
-def height_prior(view: View, radius: float) -> sphere_fit.Height:
+def solve_radius(
+    name: str, photograph: Raster, plate: Raster | None, camera: Camera, view: View,
+    click_px: tuple[float, float] | None = None,
+) -> tuple[float, float]:  # fmt: skip
+    """Radius [m] and its standard uncertainty of a ball of unknown size that stands on the plane.
+
+    The outline is found at any size and fitted without the plane; the sphere along its cone that touches the plane is
+    the ball. Raises CaptureError when there is none, or its outline leaves the radius open by a quarter.
+    """
+    signals, nominal = signals_of(photograph, plate), 0.05
+    places = seeds.search_anywhere(signals, camera, nominal, 3, click_px)
+    pair = best_fit(signals, photograph, camera, nominal, height_prior(view, nominal), list(places), False)
+    least = MIN_MERIT_ANYWHERE if click_px is None else 0.5 * MIN_MERIT
+    if pair is None or pair[0].merit < least:
+        merit = 0.0 if pair is None else pair[0].merit
+        raise CaptureError(
+            f"{name}: no mirror ball of any size: an outline seen from {merit:.0%} of its azimuths, needed "
+            f"{least:.0%}; give probe.diameter_m, or click_px near its centre"
+        )
+    radius, sigma = nominal, np.inf
+    for _ in range(2):  # the height's uncertainty is proportional to the radius
+        radius, sigma = sphere_fit.radius_on_plane(pair[1], nominal, height_prior(view, radius))
+    if not (radius > 0 and sigma < 0.25 * radius):
+        raise CaptureError(
+            f"{name}: the plane gives a ball radius of {radius * 1e3:.1f} +- {sigma * 1e3:.1f} mm, needed 25 % or "
+            "better; give probe.diameter_m"
+        )
+    return radius, sigma
+
+
+def height_prior(view: View, radius: float) -> Height:
     """The ball stands on y = 0: its centre is at y = R, as surely as the pose and the contact are known."""
     down = view.world_from_camera[1]
     ahead = view.world_from_camera[:3, 2]  # the ball is about where the camera looks at the plane
@@ -77,7 +135,7 @@ def height_prior(view: View, radius: float) -> sphere_fit.Height:
     slope = np.array([arm[2], 0.0, -arm[0], 0.0, 1.0, 0.0])  # dy = (w x arm)_y + d_y, in conventions' order
     by_pose = float(slope @ view.covariance @ slope)
     sigma = float(np.sqrt(max(by_pose, 0.0) + (STAND_SIGMA * radius) ** 2))
-    return sphere_fit.Height(down[:3].copy(), float(down[3]), sigma)
+    return Height(down[:3].copy(), float(down[3]), sigma)
 
 
 def signals_of(photograph: Raster, plate: Raster | None) -> list[np.ndarray]:
@@ -97,25 +155,45 @@ def signals_of(photograph: Raster, plate: Raster | None) -> list[np.ndarray]:
 
 
 def best_fit(
-    signals: list[np.ndarray], camera: Camera, radius: float, height: sphere_fit.Height, seeds: list[np.ndarray]
-) -> tuple[sphere_fit.SphereFit, sphere_fit.SphereFit] | None:
-    """The fit, with and without the plane, whose outline stands out most from chance; None without any."""
-    settled = [sphere_fit.settle(signals, camera, radius, seed, height) for seed in seeds if seed[2] > radius]
-    settled.sort(key=lambda place: -(place[1] ** 2) / max(place[2], 1e-12))  # votes, and their excess over chance
-    fits = [sphere_fit.fit_sphere(signals, camera, radius, place, height) for place in settled[:3]]
-    fits = [pair for pair in fits if np.isfinite(pair[0].rms_px)]
+    signals: list[np.ndarray], photograph: Raster, camera: Camera, radius: float, height: Height,
+    places: list[np.ndarray], on_plane: bool,
+) -> tuple[sphere_fit.SphereFit, sphere_fit.SphereFit] | None:  # fmt: skip
+    """The fit, with and without the plane, whose outline most azimuths see; None without any."""
+    prior = height if on_plane else None
+    settled = []
+    for place in places:
+        if place[2] > radius:
+            centre, votes, chance = seeds.settle(signals, camera, radius, place, prior)
+            share, even = seeds.coverage(signals, camera, centre, radius)
+            size = radius_in_pixels(camera, centre, radius)
+            settled.append(((share - even) * np.sqrt(min(size, 100.0)), centre, votes / max(chance, 1e-12), votes))
+    settled.sort(key=lambda place: -place[0])  # azimuths' excess over chance, in its spread: small outlines find more
+    picture, variance, valid = measured(photograph)
+    fits = []
+    for _, centre, contrast, votes in settled[:2]:
+        pair = sphere_fit.fit_sphere(picture, variance, valid, camera, radius, centre, prior, 0.0, contrast, votes)
+        if pair[0].rms_px < MAX_RMS_PX and np.linalg.norm(pair[0].centre) > 1.05 * radius:
+            fits.append(tuple(replace(fit, support=seen(signals, camera, fit, radius)) for fit in pair))
 
     def merit(pair: tuple[sphere_fit.SphereFit, sphere_fit.SphereFit]) -> float:
         inside = change_at(signals[0], camera, pair[0].centre, radius, INNER) if len(signals) > 1 else 1.0
         beside = change_at(signals[0], camera, pair[0].centre, radius, (1.1, 1.25)) if len(signals) > 1 else 0.0
         return pair[0].merit * inside / (inside + beside + 1e-12)
 
-    return max(fits, key=merit, default=None)
+    return max(fits, key=merit, default=None)  # type: ignore[arg-type, return-value]
 
 
-def is_ball(fit: sphere_fit.SphereFit) -> bool:
-    """Whether enough of the outline is there."""
-    return fit.merit >= MIN_MERIT
+def seen(signals: list[np.ndarray], camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> float:
+    """Share of the azimuths in frame that see the outline, what chance would give taken off: 0 to 1."""
+    share, chance = seeds.coverage(signals, camera, fit.centre, radius)
+    return max(share - chance, 0.0) / (1 - chance)
+
+
+def measured(photograph: Raster) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Radiance and variance (H, W, 3), finite, and which pixels (H, W) are neither clipped nor broken."""
+    rgb, variance = photograph.rgb(), photograph.rgb("variance")
+    valid = np.isfinite(rgb).all(-1) & np.isfinite(variance).all(-1) & (photograph["mask"] & (CLIPPED | HOT) == 0)
+    return np.where(valid[..., None], rgb, 0), np.where(valid[..., None], variance, 0), valid
 
 
 def change_at(
@@ -123,7 +201,7 @@ def change_at(
 ) -> float:
     """Median absolute signal on circles of these fractions of the outline, as far as they are in the frame."""
     azimuth = 2 * np.pi * np.arange(90) / 90
-    px = np.concatenate([sphere_fit.silhouette(camera, centre, radius * f, azimuth)[0] for f in fractions])
+    px = np.concatenate([silhouette(camera, centre, radius * f, azimuth)[0] for f in fractions])
     px = px[((px >= 0) & (px < (camera.width, camera.height))).all(1)].astype(int)
     return float(np.median(np.abs(signal[px[:, 1], px[:, 0]]))) if len(px) else 0.0
 
@@ -154,13 +232,18 @@ def complaints(name: str, ball: Found, radius: float) -> list[str]:
         said.append(f"{name}: ball at {ratio:.2f} radii: the blind cone is {blind:.0f} degrees")
     if fit.radius_px < FLAG_RADIUS_PX:
         said.append(f"{name}: ball radius {fit.radius_px:.0f} px, below {FLAG_RADIUS_PX:.0f}: directions are coarse")
+    if not ball.on_plane:
+        said.append(f"{name}: the ball was not found on the plane but by {ball.seed}: fitted from its rim alone")
+    if fit.blur_px > SOFT_PX:
+        said.append(f"{name}: the ball's rim is blurred by {fit.blur_px:.1f} px: out of focus?")
     if fit.visible < 1:
         said.append(f"{name}: the frame cuts the ball; {fit.visible:.0%} of its outline is used, the rest is not seen")
     gap, sigma = discrepancy(ball, radius)
     if abs(gap) > 4 * sigma:
+        believed = "The plane was believed" if ball.on_plane else "The rim was believed"
         said.append(
             f"{name}: the rim alone puts the ball {gap * 1e3:+.1f} +- {sigma * 1e3:.1f} mm off the plane: does it "
-            "stand on it, are diameter and pose right? The plane was believed"
+            f"stand on it, are diameter and pose right? {believed}"
         )
     return said
 

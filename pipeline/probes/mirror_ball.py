@@ -16,7 +16,7 @@ from pipeline.conventions import CLIPPED, invert_rigid, latlong_solid_angles
 from pipeline.probes import combine, photographer, sphere_fit
 from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
-from pipeline.probes.finding import Found, complaints, discrepancy, find_ball
+from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, solve_radius
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.parallax import set_down
@@ -35,15 +35,19 @@ class MirrorBall:
     def observe(self, shots: Shots, grid: Grid) -> Observation:
         """One map per ball view. Raises CaptureError when there is no ball, or it cannot be used."""
         facts, photographs, views = shots.facts, shots.photographs, shots.views
-        radius = 0.5 * float(facts["probe"]["diameter_m"])
         names = [ball["name"] for ball in sorted(facts["ball"], key=lambda ball: not ball.get("tripod", False))]
         tripod = {ball["name"] for ball in facts["ball"] if ball.get("tripod", False)}
         warnings: list[str] = []
+        radius, radius_sigma = radius_of(shots, names, tripod, warnings)
+        clicks = {ball["name"]: ball.get("click_px") for ball in facts["ball"]}
         found: dict[str, Found] = {}
         for name in names:
             plate = photographs["plate"] if name in tripod else None
             near = [ball.centre_world for ball in found.values()]
-            found[name] = find_ball(name, photographs[name], plate, shots.camera_of(name), views[name], radius, near)
+            found[name] = find_ball(
+                name, photographs[name], plate, shots.camera_of(name), views[name], radius, near, clicks[name],
+                radius_sigma,
+            )  # fmt: skip
             warnings += complaints(name, found[name], radius)
         known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM))
         warnings += known.warnings
@@ -76,6 +80,29 @@ class MirrorBall:
             shaped.maps, centre, balls, numbers | known.numbers | shaped.numbers, warnings,
             [*evidence, *shaped.evidence], scale_sigma=known.surface.sigma, smooth_only=shaped.smooth_only,
         )  # fmt: skip
+
+
+def radius_of(shots: Shots, names: list[str], tripod: set[str], warnings: list[str]) -> tuple[float, float]:
+    """Radius [m] and its standard uncertainty: given, or solved from the plane in every view and averaged."""
+    diameter = shots.facts["probe"].get("diameter_m")
+    if diameter is not None:
+        return 0.5 * float(diameter), 0.0
+    clicks = {ball["name"]: ball.get("click_px") for ball in shots.facts["ball"]}
+    solved = np.array(
+        [
+            solve_radius(
+                name, shots.photographs[name], shots.photographs["plate"] if name in tripod else None,
+                shots.camera_of(name), shots.views[name], clicks[name],
+            )
+            for name in names
+        ]
+    )  # fmt: skip
+    weight = 1 / solved[:, 1] ** 2
+    radius, sigma = float((weight * solved[:, 0]).sum() / weight.sum()), float(weight.sum() ** -0.5)
+    warnings.append(
+        f"the ball's diameter was not given: {2e3 * radius:.2f} +- {2e3 * sigma:.2f} mm by the plane it stands on"
+    )
+    return radius, sigma
 
 
 def view_map(
@@ -124,7 +151,7 @@ def usable_rim(fit: sphere_fit.SphereFit, radius: float) -> float:
     rim = np.linspace(MIN_RIM, 1, 2000, endpoint=False)
     sigma = radians_per_pixel(rim, ratio, fit.radius_px)[0] * np.hypot(edge, PIXEL_SIGMA)
     unseen = np.pi - deviation(rim, ratio)
-    margin = EDGE_PX + max(fit.inset_px, 0.0) + 3 * edge
+    margin = EDGE_PX + fit.blur_px + 3 * edge
     good = (3 * sigma < unseen) & (rim < 1 - margin / fit.radius_px)
     return float(rim[good].max(initial=MIN_RIM))
 
@@ -171,7 +198,7 @@ def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
         "centre_sigma_mm": (1e3 * np.sqrt(np.diag(fit.covariance))).tolist(),
         "rms_px": fit.rms_px, "points": fit.points, "radius_px": fit.radius_px,
         "distance_over_radius": distance / radius,
-        "rim_inset_px": fit.inset_px, "outline_support": fit.support, "outline_contrast": fit.contrast,
+        "rim_blur_px": fit.blur_px, "outline_support": fit.support, "outline_contrast": fit.contrast,
         "outline_in_frame": fit.visible, "height_discrepancy_mm": 1e3 * gap,
         "height_discrepancy_sigma_mm": 1e3 * gap_sigma,
         "blind_half_angle_deg": float(np.degrees(blind_half_angle(radius / distance))),

@@ -38,6 +38,7 @@ class BallFacts(Strict):
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     files: list[str] = Field(min_length=1)
     tripod: bool = Field(False, description="taken from the plate's own camera position")
+    click_px: tuple[float, float] | None = Field(None, description="near the ball's centre; used only if not found")
     camera: CameraFacts | None = Field(None, description="of another body, lens or size; without it, the plate's")
 
     @model_validator(mode="after")

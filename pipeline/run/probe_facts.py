@@ -13,7 +13,7 @@ class MirrorBallFacts(Strict):
     """A polished ball, photographed in the [[ball]] views."""
 
     kind: Literal["mirror_ball"] = "mirror_ball"
-    diameter_m: float = Field(gt=0.005, lt=2.0, description="metres")
+    diameter_m: float | None = Field(None, gt=0.005, lt=2.0, description="metres; without it, solved from the plane")
     reflectance: Rgb | None = Field(None, description="linear RGB, head on; without it, measured from the plane")
     reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
     material: Metal | None = Field(None, description="clean metal: its reflectance, or that given at all its angles")
