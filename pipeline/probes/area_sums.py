@@ -34,7 +34,7 @@ def area_sums(
     """
     height, width = corners[0].shape[0] - 1, corners[0].shape[1] - 1
     size = np.pi / width * mirror.radius_px
-    outside = corners[2] > np.arcsin(mirror.rim)
+    outside = corners[2] > np.arcsin(min(mirror.rim + 1 / mirror.radius_px, 0.5 + 0.5 * mirror.rim))  # pixels are wide
     outline = mirror.ends
     sums = np.zeros((height, width, len(channels)), np.float32)
     with ThreadPoolExecutor(WORKERS) as pool:
