@@ -37,7 +37,7 @@ STUDENT = 4.0  # degrees of freedom that the noise model has in a sector's weigh
 MODEL_REL = 1e-3  # of the radiance: no model of the light is better than this
 # What the sectors have in common that the sandwich cannot see, in blurs: a common inset, and a drift to one side.
 # Measured over simulated balls by `benchmarks.probe_fit.coverage`.
-INSET_BLURS, DRIFT_BLURS = 0.3, 0.3
+INSET_BLURS, DRIFT_BLURS = 0.47, 0.47
 
 
 @dataclass(frozen=True)
