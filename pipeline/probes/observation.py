@@ -34,7 +34,8 @@ class Shots:
 class Grid:
     """The map that is asked for: ``width`` texels around, half as many down.
 
-    ``supersample``: least lookups per texel and axis; ``rim``: outermost radius of a ball that may be used, as a fraction.
+    ``supersample``: least lookups per texel and axis; ``rim``: outermost radius of a ball that may be used, as a
+    fraction of its outline's.
     """
 
     width: int

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.lens import unproject
-from pipeline.probes.outline import Height, azimuths, radius_in_pixels, silhouette
+from pipeline.probes.outline import azimuths, radius_in_pixels, silhouette
 from pipeline.types import Camera
 
 ARC_PX, MAX_SECTORS = 5.0, 180  # length of a sector; more sectors than these are thinned evenly
@@ -187,10 +187,9 @@ def evidence(patches: Patches, left: np.ndarray, determinant: np.ndarray) -> np.
 
 
 def fit_rim(
-    patches: Patches, camera: Camera, centre: np.ndarray, radius: float, blur: float, prior: Height | None,
-    steps: int = 10,
+    patches: Patches, camera: Camera, centre: np.ndarray, radius: float, blur: float, steps: int = 10
 ) -> RimFit:  # fmt: skip
-    """Gauss-Newton on (centre, log blur) over the sectors of `gather`; ``prior`` is the plane's height."""
+    """Gauss-Newton on (centre, log blur) over the sectors of `gather`."""
     size, distance = radius_in_pixels(camera, centre, radius), float(np.linalg.norm(centre))
     frame = np.linalg.svd(centre[None] / distance)[2]  # along the ray, and two across
     frame[0] = centre / distance
@@ -199,7 +198,6 @@ def fit_rim(
     freedom = np.maximum(patches.use.sum(1) - 5, 1)[:, None]
     relative = np.sqrt(patches.floor.mean(-1))
     converged, held, normal = False, np.eye(4), np.eye(4)
-    lever = np.zeros(4)
     for _ in range(steps):
         score, hessian, relative = _slopes(patches, centre, radius, blur, size, relative, freedom, frame, scale)
         share = agreement(score, hessian)
@@ -208,10 +206,6 @@ def fit_rim(
         normal[3, 3] += 1 / BLUR_LOG_SIGMA**2
         pull[3] += np.log(blur / BLUR_PX) / BLUR_LOG_SIGMA**2
         held = normal + 1e-6 * np.trace(normal) * np.eye(4)
-        if prior is not None:
-            lever = np.append(scale * (frame @ prior.normal), 0) / prior.sigma_m
-            held = held + np.outer(lever, lever)
-            pull = pull + lever * (prior.of(centre) - radius) / prior.sigma_m
         step = np.linalg.solve(held, pull)
         step[:3] *= min(1.0, 1.0 / max(np.abs(step[:3]).max(), 1e-12))  # a pixel at a time
         step[3] = np.clip(step[3], -0.3, 0.3)
@@ -220,7 +214,7 @@ def fit_rim(
         if np.abs(step).max() < 5e-3:
             converged = True
             break
-    covariance = _covariance(score, normal, held, lever, blur)
+    covariance = _covariance(score, normal, held, blur)
     turn = np.eye(4)
     turn[:3, :3] = frame.T * scale
     information = np.maximum(np.einsum("skk->s", hessian[:, :3, :3]), 1e-12)
@@ -264,11 +258,11 @@ def agreement(score: np.ndarray, hessian: np.ndarray) -> np.ndarray:
     return 1 / (1 + information * (SCATTER * middle) ** 2) / (1 + (astray / (CAUCHY * middle)) ** 2)
 
 
-def _covariance(score: np.ndarray, normal: np.ndarray, held: np.ndarray, lever: np.ndarray, blur: float) -> np.ndarray:
-    """Clustered sandwich (4, 4) in pixels of rim, with the prior's lever, and what all sectors have in common."""
+def _covariance(score: np.ndarray, normal: np.ndarray, held: np.ndarray, blur: float) -> np.ndarray:
+    """Clustered sandwich (4, 4) in pixels of rim, and what all sectors have in common."""
     inverse = np.linalg.inv(held)
     centred = score - score.mean(0)
-    meat = centred.T @ centred * len(score) / max(len(score) - 4, 1) + np.outer(lever, lever)
+    meat = centred.T @ centred * len(score) / max(len(score) - 4, 1)
     common = np.diag(np.square([INSET_BLURS * blur, DRIFT_BLURS * blur, DRIFT_BLURS * blur, 0]))
     meat = meat + normal @ common @ normal
     return inverse @ meat @ inverse

@@ -8,7 +8,7 @@ they can be compared. An unknown radius scales the sphere along its cone until i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class SphereFit:
 
     ``support``: fraction of the outline's sectors that voted for it rather than for outlines beside it; ``contrast``:
     votes for the outline over the median votes of outlines moved by up to 10 px; ``visible``: fraction of the outline
-    in the frame; ``inset_px``: of the steepest place of the rim's profile, what the blur accounts for.
+    in the frame; ``blur_px``: sigma of the rim's blur.
     """
 
     centre: np.ndarray
@@ -69,40 +69,40 @@ def fit_sphere(
     fit's ``rms_px`` is infinite.
     """
     visible = fraction_in_frame(camera, start, radius)
-    fits: list[SphereFit] = []
-    centre, blur = start, rim.BLUR_PX
-    for prior in (None, height):
-        found = None
-        if fits and prior is None:
-            fits.append(fits[0])
-            continue
-        for turn in range(ROUNDS if not fits else 1):
-            patches = rim.gather(
-                picture,
-                variance,
-                valid,
-                camera,
-                centre,
-                radius,
-                blur,
-                REACH_PX if turn == 0 and not fits else rim.BESIDE_PX,
-            )
-            if patches is None:
-                break
-            found = rim.fit_rim(patches, camera, centre, radius, blur, prior)
-            centre, blur = found.centre, found.blur_px
-        size = radius_in_pixels(camera, centre, radius)
-        if found is None or not np.isfinite(centre).all():
-            nothing = np.full((3, 3), np.inf)
-            fits.append(SphereFit(start, nothing, np.inf, 0, size, blur, support, contrast, visible, votes, False))
-            continue
-        fits.append(
-            SphereFit(
-                centre, found.covariance[:3, :3], found.rms_px, found.sectors, size, blur, support, contrast,
-                fraction_in_frame(camera, centre, radius), votes, found.converged,
-            )
-        )  # fmt: skip
-    return fits[1], fits[0]
+    centre, blur, found = start, rim.BLUR_PX, None
+    for turn in range(ROUNDS):
+        beside = REACH_PX if turn == 0 else rim.BESIDE_PX
+        patches = rim.gather(picture, variance, valid, camera, centre, radius, blur, beside)
+        if patches is None:
+            break
+        found = rim.fit_rim(patches, camera, centre, radius, blur)
+        centre, blur = found.centre, found.blur_px
+    size = radius_in_pixels(camera, centre, radius)
+    if found is None or not np.isfinite(centre).all():
+        nothing = np.full((3, 3), np.inf)
+        none = SphereFit(start, nothing, np.inf, 0, size, blur, support, contrast, visible, votes, False)
+        return none, none
+    free = SphereFit(
+        centre, found.covariance[:3, :3], found.rms_px, found.sectors, size, blur, support, contrast,
+        fraction_in_frame(camera, centre, radius), votes, found.converged,
+    )  # fmt: skip
+    return free if height is None else standing(free, radius, height, camera), free
+
+
+def standing(free: SphereFit, radius: float, height: Height, camera: Camera) -> SphereFit:
+    """The fit with the knowledge that its centre is at ``radius`` over the plane, each by its covariance.
+
+    The rim's covariance holds what its sectors have in common, which their number does not lessen; the plane is
+    therefore joined to the finished fit (Kalman's update), not to the sectors.
+    """
+    lever = free.covariance @ height.normal
+    gain = lever / (float(height.normal @ lever) + height.sigma_m**2)
+    centre = free.centre - gain * (height.of(free.centre) - radius)
+    covariance = free.covariance - np.outer(gain, lever)
+    return replace(
+        free, centre=centre, covariance=0.5 * (covariance + covariance.T),
+        radius_px=radius_in_pixels(camera, centre, radius), visible=fraction_in_frame(camera, centre, radius),
+    )  # fmt: skip
 
 
 def radius_on_plane(fit: SphereFit, radius: float, height: Height) -> tuple[float, float]:
