@@ -119,11 +119,12 @@ def sun_picture(mirror: Mirror, sun: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[0 : camera.height : step, 0 : camera.width : step]
     coarse, _ = traced(mirror, np.stack([x.ravel(), y.ravel()], -1) + 0.5 * step)
     best = np.nan_to_num(coarse @ sun, nan=-2).argmax()
+    half = int(24 + 0.06 * camera.width / 2)  # beside the rim the sun is drawn out along it
     rows, columns = (
-        np.arange(max(0, middle - 24), min(size, middle + 24))
+        np.arange(max(0, middle - half), min(size, middle + half))
         for middle, size in ((y.ravel()[best], camera.height), (x.ravel()[best], camera.width))
     )
-    hit = _hits(mirror, sun, rows, columns, 16) > 0
+    hit = _hits(mirror, sun, rows, columns, 8) > 0
     rows, columns = (
         lines[max(0, seen[0] - 1) : seen[-1] + 2]
         for lines, seen in ((rows, np.flatnonzero(hit.any(1))), (columns, np.flatnonzero(hit.any(0))))
