@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes import sphere_fit
-from pipeline.probes.finding import measured
+from pipeline.probes.anchor import anchored
+from pipeline.probes.finding import Found, measured
 from pipeline.probes.outline import Height, azimuths, radius_in_pixels, silhouette
 from pipeline.probes.reflection import directions_from_rays
-from pipeline.types import Camera, Raster
+from pipeline.types import Camera, Raster, View
 from tests.mirror_scene import Lamp, Place, look_at, sky
 
 RADIUS = 0.04
@@ -148,14 +150,21 @@ def direction_rms_deg(fitted: np.ndarray, true: np.ndarray, radius: float = RADI
 
 
 def fitted(setup: Setup, start_px: float = 0.7, on_plane: bool = False) -> dict[str, float]:
-    """One simulated ball, fitted from a start that is ``start_px`` off: errors, predicted sigma, blur."""
-    raster, place, camera, pose = picture(setup)
+    """One simulated ball, fitted from a start that is ``start_px`` off: errors, predicted sigma, blur.
+
+    ``on_plane``: with the plane, its height and its mirror image, as the stage has it; else by the rim alone.
+    """
+    raster, place, camera, pose = picture(setup, 5 if setup.radius_px < FINE_PX else 3)
     true = transform_points(invert_rigid(pose), np.array(place.ball, float))
     size = radius_in_pixels(camera, true, RADIUS)
     off = start_px * np.random.default_rng(setup.seed + 7).normal(size=3)
     start = true * (1 + off[2] / size) + np.array([off[0], off[1], 0]) * RADIUS / size
     height = Height(pose[1, :3].copy(), float(pose[1, 3]), 5e-3 * RADIUS) if on_plane else None
-    fit, _ = sphere_fit.fit_sphere(*measured(raster), camera, RADIUS, start, height)
+    fit, free = sphere_fit.fit_sphere(*measured(raster), camera, RADIUS, start, height)
+    if height is not None:  # as the stage does: joined with the plane's mirror image
+        view = View(world_from_camera=pose, covariance=1e-10 * np.eye(6), route="given", rms_px=0.1, points=20)
+        found = Found(fit, free, height, transform_points(pose, fit.centre))
+        fit = anchored(found, raster, camera, view, RADIUS)[0].fit
     error = fit.centre - true
     covariance = fit.covariance + 1e-18 * np.eye(3)
     rng, drawn = np.random.default_rng(1), []
@@ -199,8 +208,16 @@ def orthographic_rms_deg(camera: Camera, true: np.ndarray, radius: float = RADIU
 RATIOS, OFF_AXIS_DEG, RADII_PX, BLURS_PX = (3.0, 5.0, 10.0, 20.0, 50.0), (0.0, 15.0, 30.0), (30, 50, 200, 400), (1.5,)
 
 
+FINE_PX = 150  # of radius, from which pixels are so small that fewer rays do
+MARGIN = 2.6  # radii of the plane about the ball that the photograph shows
+
+
+def _on_plane(setup: Setup) -> dict[str, float]:
+    return fitted(setup, on_plane=True)
+
+
 def sweep(
-    seeds: int = 2, ratios: tuple[float, ...] = RATIOS, off_axis: tuple[float, ...] = OFF_AXIS_DEG,
+    seeds: int = 3, ratios: tuple[float, ...] = RATIOS, off_axis: tuple[float, ...] = OFF_AXIS_DEG,
     radii: tuple[float, ...] = RADII_PX, blurs: tuple[float, ...] = BLURS_PX,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Rows of the figure: rms over ``seeds`` of each cell, over distance and angle at 100 px, over radius, over blur.
@@ -211,9 +228,13 @@ def sweep(
     """
     cells = [Setup(distance_ratio=ratio, off_axis_deg=angle) for ratio in ratios for angle in off_axis]
     cells += [Setup(radius_px=float(size)) for size in radii] + [Setup(blur_px=blur) for blur in blurs]
+    jobs = [replace(cell, seed=100 + seed, margin=MARGIN) for cell in cells for seed in range(seeds)]
+    with ProcessPoolExecutor() as pool:
+        each = list(pool.map(_on_plane, jobs))
+    measured_cells = {cell: each[i * seeds : (i + 1) * seeds] for i, cell in enumerate(cells)}
     rows = []
     for cell in cells:
-        found = [fitted(replace(cell, seed=100 + seed)) for seed in range(seeds)]
+        found = measured_cells[cell]
         rms = {key: float(np.sqrt(np.mean([one[key] ** 2 for one in found]))) for key in found[0]}
         rows.append(
             {

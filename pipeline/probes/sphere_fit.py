@@ -105,6 +105,17 @@ def standing(free: SphereFit, radius: float, height: Height, camera: Camera) -> 
     )  # fmt: skip
 
 
+def joined(fit: SphereFit, radius: float, moved: np.ndarray, covariance: np.ndarray, camera: Camera) -> SphereFit:
+    """The fit joined with an independent measurement ``moved`` (3,) [m] from its centre, by both covariances (3, 3)."""
+    gain = fit.covariance @ np.linalg.inv(fit.covariance + covariance)
+    centre = fit.centre + gain @ moved
+    kept = (np.eye(3) - gain) @ fit.covariance
+    return replace(
+        fit, centre=centre, covariance=0.5 * (kept + kept.T), radius_px=radius_in_pixels(camera, centre, radius),
+        visible=fraction_in_frame(camera, centre, radius),
+    )  # fmt: skip
+
+
 def radius_on_plane(fit: SphereFit, radius: float, height: Height) -> tuple[float, float]:
     """Radius [m] of the ball on the plane that has the outline of ``fit``, and its standard uncertainty.
 

@@ -1,0 +1,53 @@
+"""The ball's centre by the plane that it mirrors: the rim says where the outline is, the plane's image says it better.
+
+A mirror's rim continues its background, so that one side of it can drift by a pixel. The plane's texture is seen twice,
+directly and in the ball, and where its mirror image lies depends on the centre alone (`ball_shape.centre_from_plane`).
+Both are joined by their covariances. Needs a plane with texture near the ball, and the ball standing on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.conventions import transform_points
+from pipeline.probes import ball_shape, sphere_fit
+from pipeline.probes.ball_pairs import neighbourhood, plane_pairs
+from pipeline.probes.finding import Found
+from pipeline.types import Camera, Raster, View
+
+ROUNDS = 3  # each about the moved centre: patches are matched where they lie
+MOST_LEFT_PX = 0.6  # that patches may leave: 0.1 to 0.2 on two captures
+RIM = 0.97  # outermost radius whose pixels are compared
+MOST_CHI2 = 25.0  # of the two centres, 3 degrees of freedom: beyond, one of them is not of a sphere on this plane
+
+
+def anchored(
+    ball: Found, photograph: Raster, camera: Camera, view: View, radius: float
+) -> tuple[Found, dict[str, Any]]:
+    """The ball with its centre joined with the mirrored plane's, and what that measured; as it was where it cannot."""
+    if not ball.on_plane:
+        return ball, {"used": False, "why": "the ball is not on the plane"}
+    moved, covariance, left = np.zeros(3), np.zeros((3, 3)), 0.0
+    centre = ball.fit.centre
+    for _ in range(ROUNDS):
+        sight = neighbourhood(photograph, camera, view.world_from_camera, centre, radius)
+        shifts = ball_shape.patch_shifts(plane_pairs(sight, RIM, every=True))
+        found = ball_shape.centre_from_plane(sight, ball.fit.radius_px / sight.binned, shifts)
+        if found is None:
+            return ball, {"used": False, "why": "too little of the plane's texture is mirrored"}
+        step, covariance, left = found
+        centre = centre + step
+    moved = centre - ball.fit.centre
+    chi2 = float(moved @ np.linalg.solve(ball.fit.covariance + covariance, moved))
+    pixels = float(np.linalg.norm(moved - (moved @ centre) / (centre @ centre) * centre) * ball.fit.radius_px / radius)
+    numbers = {"moved_px": pixels, "chi2": chi2, "left_px": left}
+    if left > MOST_LEFT_PX:
+        return ball, {"used": False, "why": "no sphere fits the plane's mirror image", **numbers}
+    if chi2 > MOST_CHI2:
+        return ball, {"used": False, "why": "rim and mirrored plane disagree", **numbers}
+    fit = sphere_fit.joined(ball.fit, radius, moved, covariance, camera)
+    there = transform_points(view.world_from_camera, fit.centre)
+    return replace(ball, fit=fit, centre_world=there), {"used": True, **numbers}
