@@ -73,7 +73,10 @@ def patch_shifts(pairs: Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     size = np.array([row.max(), column.max()]) - low + 1 if len(row) else np.ones(2, int)
     real, model, mask = np.zeros(size), np.zeros(size), np.zeros(size)
     at = row - low[0], column - low[1]
-    real[at], model[at], mask[at] = np.log(pairs.mirrored[ok]).mean(1), np.log(pairs.direct[ok]).mean(1), 1
+    # A power of two: a stop more or less of exposure leaves the same bits, and the same shifts.
+    level = 2.0 ** np.round(np.log2(np.median(pairs.direct[ok]))) if len(row) else 1.0
+    real[at], model[at] = (np.log(part[ok] / level).mean(1) for part in (pairs.mirrored, pairs.direct))
+    mask[at] = 1
     shifts = np.arange(-REACH, REACH + 1)
     misfit = np.full((len(shifts), len(shifts), *size), np.inf)
     padded = [np.pad(part, REACH) for part in (model, mask)]

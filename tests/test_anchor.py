@@ -1,0 +1,73 @@
+"""The ball's centre by the plane it mirrors, against ray-traced balls of known place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mirror_scene import Lamp, Place, look_at, photograph, sky
+
+from pipeline.conventions import invert_rigid, transform_points
+from pipeline.probes.anchor import anchored
+from pipeline.probes.finding import Found
+from pipeline.probes.outline import Height, radius_in_pixels
+from pipeline.probes.sphere_fit import SphereFit
+from pipeline.types import Camera, Raster, View
+
+RADIUS = 0.04
+CENTRE = np.array([0.0, RADIUS, 0.0])
+POSE = look_at((0.30, 0.28, 0.12), (0.03, 0.02, 0.0))
+CAMERA = Camera(width=420, height=340, fx=800.0, fy=800.0, cx=210.0, cy=170.0)
+PIXEL = RADIUS / radius_in_pixels(CAMERA, transform_points(invert_rigid(POSE), CENTRE), RADIUS)
+SIGMA = np.diag([0.5 * PIXEL, 0.5 * PIXEL, 0.01 * RADIUS]) ** 2  # a rim that may drift by half a pixel
+
+
+@pytest.fixture(scope="module")
+def picture() -> Raster:
+    place = Place(sky([Lamp((0.3, 0.8, 0.4), 0.06, 50.0)]), plane=True, reflectance=0.8)
+    rgb = photograph(place, CAMERA, POSE, 3, 0.005, 1)
+    noise = {"variance.R": rgb[..., 0], "variance.G": rgb[..., 1], "variance.B": rgb[..., 2]}
+    variance = {name: (0.005 * value) ** 2 for name, value in noise.items()}
+    return Raster({**Raster.split(rgb), **variance, "mask": np.zeros(rgb.shape[:2], np.uint32)}, "acescg")
+
+
+def ball(off_px: tuple[float, float]) -> Found:
+    """A fit that is off across the ray by so many pixels."""
+    true = transform_points(invert_rigid(POSE), CENTRE)
+    there = true + np.array([*off_px, 0.0]) * PIXEL
+    fit = SphereFit(there, SIGMA, 0.2, 100, RADIUS / PIXEL, 0.8, 0.9, 3.0, 1.0)
+    height = Height(POSE[1, :3].copy(), float(POSE[1, 3]), 2e-4)
+    return Found(fit, fit, height, transform_points(POSE, there))
+
+
+VIEW = View(world_from_camera=POSE, covariance=1e-10 * np.eye(6), route="given", rms_px=0.1, points=20)
+
+
+def across_px(found: Found) -> float:
+    error = found.fit.centre - transform_points(invert_rigid(POSE), CENTRE)
+    ray = found.fit.centre / np.linalg.norm(found.fit.centre)
+    return float(np.linalg.norm(error - (error @ ray) * ray) / PIXEL)
+
+
+@pytest.mark.parametrize("off_px", [(0.0, 0.0), (1.0, 0.0), (-0.7, 0.8)])
+def test_drifted_rim_is_brought_back(picture, off_px):
+    found, numbers = anchored(ball(off_px), picture, CAMERA, VIEW, RADIUS)
+    assert numbers["used"]
+    # The rim's pull, (0.15 / 0.5)^2 of it, and twice what the patches share, 0.15 px.
+    assert across_px(found) < 0.09 * np.hypot(*off_px) + 0.3
+    assert found.centre_world == pytest.approx(transform_points(POSE, found.fit.centre))
+    assert (np.linalg.eigvalsh(found.fit.covariance) > 0).all()
+    assert np.trace(found.fit.covariance) < np.trace(SIGMA)
+
+
+def test_contradiction_and_no_texture_leave_the_rim_alone(picture):
+    sure = ball((2.5, 0.0))
+    sure = replace(sure, fit=replace(sure.fit, covariance=1e-2 * SIGMA))
+    found, numbers = anchored(sure, picture, CAMERA, VIEW, RADIUS)
+    assert found is sure
+    assert "disagree" in numbers["why"]
+    even = Raster({k: np.ones_like(v) if k in "RGB" else v for k, v in picture.channels.items()}, "acescg")
+    found, numbers = anchored(ball((0.0, 0.0)), even, CAMERA, VIEW, RADIUS)
+    assert not numbers["used"]
+    assert not anchored(replace(sure, on_plane=False), picture, CAMERA, VIEW, RADIUS)[1]["used"]
