@@ -52,7 +52,7 @@ class Pose(Params):
 
 
 class Probe(Params):
-    """From mirror-ball photographs to an environment map."""
+    """From photographs of a probe to an environment map."""
 
     width: int = Field(1024, ge=64, le=8192, description="width of the lat-long [px]; its height is half")
     supersample: int = Field(3, ge=1, le=16, description="samples per texel and axis")

@@ -31,7 +31,7 @@ TITLES = {
         "Where the camera stood",
         "The board's squares drawn through the estimated lens and pose must lie on its print.",
     ),
-    "probe": ("The light", "The mirror ball unwrapped to a world-oriented map; blind directions are marked."),
+    "probe": ("The light", "What the probe saw as a world-oriented map; directions that it did not see are marked."),
     "lights": ("Lamps and sky", "Compact lights told apart from the map; each casts its own hard shadow."),
     "plane": ("The local scene", "The rectangle of the plane whose light the objects change."),
     "reflectance": ("What the surface reflects", "The plate over the light the probe saw, equations 6 to 8."),

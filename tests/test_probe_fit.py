@@ -30,8 +30,8 @@ def test_directions_in_a_room_without_table(setup):
 
 
 def test_directions_over_a_table_with_shadows():
-    # By the rim alone, two of the easier pictures: of 24 others one in six drifted by 1 to 1.6 degrees, which is why the
-    # plane's mirror image has a say (test_anchor.py). Twice the typical 0.2 degrees.
+    # By the rim alone, two of the easier pictures: of 24 others one in six drifted by 1 to 1.6 degrees, which is why
+    # the plane's mirror image has a say (test_anchor.py). Twice the typical 0.2 degrees.
     found = [fitted(Setup(seed=seed))["direction_rms_deg"] for seed in range(2)]
     assert np.sqrt(np.mean(np.square(found))) < 0.45
 
