@@ -61,13 +61,20 @@ def test_drifted_rim_is_brought_back(picture, off_px):
     assert np.trace(found.fit.covariance) < np.trace(SIGMA)
 
 
-def test_contradiction_and_no_texture_leave_the_rim_alone(picture):
+def test_plane_whose_patches_agree_is_believed_against_the_rim(picture):
     sure = ball((2.5, 0.0))
     sure = replace(sure, fit=replace(sure.fit, covariance=1e-2 * SIGMA))
     found, numbers = anchored(sure, picture, CAMERA, VIEW, RADIUS)
-    assert found is sure
-    assert "disagree" in numbers["why"]
+    assert numbers["used"]
+    assert numbers["against_the_rim"]
+    assert across_px(found) < 0.3  # as above, without the rim's pull
+
+
+def test_no_texture_and_no_plane_leave_the_rim_alone(picture):
     even = Raster({k: np.ones_like(v) if k in "RGB" else v for k, v in picture.channels.items()}, "acescg")
     found, numbers = anchored(ball((0.0, 0.0)), even, CAMERA, VIEW, RADIUS)
     assert not numbers["used"]
-    assert not anchored(replace(sure, on_plane=False), picture, CAMERA, VIEW, RADIUS)[1]["used"]
+    aside = replace(ball((0.0, 0.0)), on_plane=False)
+    found, numbers = anchored(aside, picture, CAMERA, VIEW, RADIUS)
+    assert found is aside
+    assert not numbers["used"]

@@ -1,8 +1,9 @@
 """The ball's centre by the plane that it mirrors: the rim says where the outline is, the plane's image says it better.
 
-A mirror's rim continues its background, so that one side of it can drift by a pixel. The plane's texture is seen twice,
-directly and in the ball, and where its mirror image lies depends on the centre alone (`ball_shape.centre_from_plane`).
-Both are joined by their covariances. Needs a plane with texture near the ball, and the ball standing on it.
+A mirror's rim continues its background, so that one side of it can drift by a pixel and more. The plane's texture is
+seen twice, directly and in the ball, and where its mirror image lies depends on the centre alone
+(`ball_shape.centre_from_plane`). Both are joined by their covariances; where they contradict each other, a plane whose
+patches agree to a third of a pixel is believed. Needs a plane with texture near the ball, and the ball standing on it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from pipeline.types import Camera, Raster, View
 ROUNDS = 3  # each about the moved centre: patches are matched where they lie
 MOST_LEFT_PX = 0.6  # that patches may leave: 0.1 to 0.2 on two captures
 RIM = 0.97  # outermost radius whose pixels are compared
-MOST_CHI2 = 25.0  # of the two centres, 3 degrees of freedom: beyond, one of them is not of a sphere on this plane
+MOST_CHI2 = 25.0  # of the two centres, 3 degrees of freedom: beyond, one of them is wrong
+SURE_PX = 0.35  # that patches may leave to be believed against the rim
+MOST_MOVED_PX, MOST_HEIGHT_SIGMA = 4.0, 3.0  # and how far it may be then: dents can look like a centre that is farther
 
 
 def anchored(
@@ -46,8 +49,20 @@ def anchored(
     numbers = {"moved_px": pixels, "chi2": chi2, "left_px": left}
     if left > MOST_LEFT_PX:
         return ball, {"used": False, "why": "no sphere fits the plane's mirror image", **numbers}
-    if chi2 > MOST_CHI2:
+    numbers["against_the_rim"] = chi2 > MOST_CHI2
+    if chi2 <= MOST_CHI2:
+        fit = sphere_fit.joined(ball.fit, radius, moved, covariance, camera)
+    elif left <= SURE_PX and pixels <= MOST_MOVED_PX and stands(ball, centre, covariance, radius):
+        seen = replace(ball.free, centre=centre, covariance=covariance)
+        fit = sphere_fit.standing(seen, radius, ball.height, camera)
+    else:
         return ball, {"used": False, "why": "rim and mirrored plane disagree", **numbers}
-    fit = sphere_fit.joined(ball.fit, radius, moved, covariance, camera)
     there = transform_points(view.world_from_camera, fit.centre)
     return replace(ball, fit=fit, centre_world=there), {"used": True, **numbers}
+
+
+def stands(ball: Found, centre: np.ndarray, covariance: np.ndarray, radius: float) -> bool:
+    """Whether a ball with this centre (3,) would stand on the plane, by the covariance and the height's."""
+    up = ball.height.normal
+    sigma = np.hypot(ball.height.sigma_m, np.sqrt(up @ covariance @ up))
+    return bool(abs(ball.height.of(centre) - radius) < MOST_HEIGHT_SIGMA * sigma)

@@ -1,8 +1,8 @@
 """How far a mirror ball is from a sphere, and what its dents do to mirrored directions.
 
 The plane is the test chart: its texture is known from the direct view, so the ball's picture of it can be predicted
-pixel by pixel, and where a patch of the real picture lies beside its prediction the surface is tilted. What stands out
-of the patches' own noise and of the fitted centre's covariance is the ball's shape. Two views bound that besides: what
+pixel by pixel, and where a patch of the real picture lies beside its prediction the surface is tilted. What no other
+centre explains and stands out of the patches' own noise is the ball's shape. Two views bound that besides: what
 they disagree on above the horizon is dents, parallax and noise together.
 
 The outline is no witness: a mirror's rim continues its background, so single stretches of it are known to 0.2 to 1.7 px
@@ -32,7 +32,7 @@ MIN_PATCHES = 8
 FLOOR_PX = 0.3  # of a perfect ball: on ray-traced ones 0.1, on two demosaicked captures 0.2 to 0.3
 # Of the centre by the mirrored plane: what patches share, against known centres on two captures 0.05 to 0.17 px.
 COMMON_PX, MAX_CONDITION = 0.15, 1e6
-SIGNIFICANT = 3.0
+SIGNIFICANT, OPEN_SIGMA = 3.0, 3.0
 TOO_DENTED = 0.1  # rad: of order l, exp(-l (l + 1) s^2 / 2) is left: 97 % of order 2, half of order 11
 GLASS_INDEX = 1.52  # soda-lime
 COMPARED_ROWS, HORIZON = 128, 0.1
@@ -40,7 +40,7 @@ COMPARED_ROWS, HORIZON = 128, 0.1
 
 @dataclass(frozen=True)
 class Dents:
-    """Shifts [px] of patches from where a sphere would have them.
+    """Shifts [px] of patches from where a sphere would have them, with its centre where the fit allows.
 
     ``direction_sigma_rad``: rms angle by which mirrored directions are off, 0 when it does not stand out of
     ``floor_rad``, what a perfect ball shows.
@@ -130,7 +130,10 @@ def _least(
 def dents(
     sight: Sight, radius_px: float, covariance: np.ndarray, shifted: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> Dents | None:
-    """What the shifts of patches mean for directions; ``covariance`` (3, 3) of the centre. None when too few."""
+    """What the shifts of patches mean for directions, beyond what another centre explains. None when too few.
+
+    ``covariance`` (3, 3) of the fitted centre: how far another one may be.
+    """
     centre, shift, error = shifted
     if len(centre) < MIN_PATCHES:
         return None
@@ -139,7 +142,10 @@ def dents(
     centre, shift, error, by_centre = centre[known], shift[known], error[known], by_centre[known]
     if len(centre) < MIN_PATCHES:
         return None
+    # Another centre is no dent, as far as the fit leaves it open; beyond, dents look like one.
     moved, _, _ = _centre_shift(by_centre, shift, error)
+    astray = float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
+    shift = shift - by_centre @ (moved * min(1.0, OPEN_SIGMA / max(astray, 1e-12)))
     arm = (centre + 0.5 - project(sight.camera, sight.centre[None])[0]) / radius_px
     sine = np.clip(np.linalg.norm(arm, axis=1), 1e-3, 0.97)
     outward = arm / np.linalg.norm(arm, axis=1)[:, None]
@@ -147,8 +153,7 @@ def dents(
     along = (shift * outward).sum(1) * radial
     beside = (shift[:, 0] * outward[:, 1] - shift[:, 1] * outward[:, 0]) * across
     angle = float(np.sqrt(np.median(along**2 + beside**2) / np.log(2)))
-    by_fit = np.einsum("nij,jk,nik->n", by_centre, covariance, by_centre) / 2  # mean of the two axes, px^2
-    noise = float(np.sqrt(np.median((error**2 + FLOOR_PX**2 + by_fit) * (radial**2 + across**2))))
+    noise = float(np.sqrt(np.median((error**2 + FLOOR_PX**2) * (radial**2 + across**2))))
     rms = float(np.sqrt(np.median((shift**2).sum(1)) / np.log(2)))
     return Dents(len(arm), rms, angle, noise, moved)
 

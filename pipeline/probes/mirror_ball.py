@@ -224,6 +224,7 @@ def centred(anchors: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Why the mirrored plane has a say in where the ball is, or has none."""
     said = [
         f"{name}: moved by {one['moved_px']:.2f} px, chi2 {one['chi2']:.1f}, {one['left_px']:.2f} px left"
+        + ", believed against the rim" * one["against_the_rim"]
         if one["used"]
         else f"{name}: {one['why']}"
         for name, one in anchors.items()
