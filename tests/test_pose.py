@@ -165,7 +165,8 @@ def test_planar_points_are_tested_for_the_second_pose() -> None:
     px = project(CAMERA, camera_points(far, world_m)[0])
     entry = {"view": "plate", "route": "points", "points": points_of(world_m, px)}
     stage_facts = facts(board=None, ball=[], pose=[entry])
-    view = pose.compute(stage_facts, {"plate": raster(np.zeros((360, 480)))}, CAMERA, {}, PARAMS).outputs["views"]["plate"]
+    photographs = {"plate": raster(np.zeros((360, 480)))}
+    view = pose.compute(stage_facts, photographs, CAMERA, {}, PARAMS).outputs["views"]["plate"]
     assert error_of(view, far)[0] < 1e-5
     assert view.alternative is not None
     assert view.ambiguity > 4
