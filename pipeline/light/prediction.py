@@ -62,10 +62,22 @@ def pixel_centres(rows: slice, columns: slice) -> np.ndarray:
 def ball_directions(
     camera: Camera, ball: BallFit, world_from_camera: np.ndarray, rows: slice, columns: slice
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World directions (h, w, 3) mirrored in each pixel of a crop, and sine of the incidence (h, w); NaN outside."""
+    """World directions (h, w, 3), as seen from the ball's centre, of what each pixel of a crop mirrors; NaN outside.
+
+    Also the sine of the incidence (h, w). Below the horizon that is the plane y = 0, at its finite place.
+    """
     px = pixel_centres(rows, columns)
     rays = pixel_rays(camera, px.reshape(-1, 2))
-    mirrored = directions_from_rays(rays, ball.centre_camera_m, ball.radius_m) @ world_from_camera[:3, :3].T
+    away = directions_from_rays(rays, ball.centre_camera_m, ball.radius_m)
+    normal = away - rays
+    normal = ball.radius_m * normal / np.linalg.norm(normal, axis=-1, keepdims=True) @ world_from_camera[:3, :3].T
+    mirrored = away @ world_from_camera[:3, :3].T
+    height = transform_points(world_from_camera, ball.centre_camera_m)[1] + normal[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = normal + np.where(mirrored[:, 1] < 0, -height / mirrored[:, 1], np.inf)[:, None] * mirrored
+        seen /= np.linalg.norm(seen, axis=-1, keepdims=True)
+        below = (mirrored[:, 1] < -1e-6) & (height > 0)
+    mirrored = np.where(below[:, None], seen, mirrored)
     sine = np.linalg.norm(np.cross(rays, ball.centre_camera_m), axis=-1) / ball.radius_m
     sine[~np.isfinite(mirrored[:, 0])] = np.nan
     return mirrored.reshape(*px.shape[:2], 3), sine.reshape(px.shape[:2])
