@@ -1,6 +1,6 @@
 """How right the light is: ``make bench-probe`` writes docs/benchmarks/probe.json, probe.md and probe.svg.
 
-    python -m benchmarks.probe [--out docs/benchmarks]
+    python -m benchmarks.probe [--parts fit,coverage,unwrap,speed,flux,captures,real] [--out docs/benchmarks]
 
 Simulated balls over distance, angle and size; a sun clipped in every frame; whole captures with truth; real balls.
 """
@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,44 +57,45 @@ def light(rows: list[dict[str, Any]], method: str) -> dict[str, float]:
     }
 
 
-def measure(folder: Path, say: Any) -> dict[str, Any]:
-    """Everything, in order of cost."""
-    record: dict[str, Any] = {"fit": probe_fit.sweep()}
-    say(f"fit: {len(record['fit'])} cells")
-    record["coverage"] = probe_fit.coverage(100)
-    say(f"fit: 95 % regions hold {record['coverage']['held_95']:.0%}")
-    record["unwrap"], record["speed"] = probe_unwrap.rows(), probe_unwrap.unwrap_s_24mpx()
-    say(f"unwrap: {record['speed']['unwrap_s_24mpx']:.2f} s of 24 Mpx")
-    record["flux"] = probe_flux.rows()
-    record["flux_summary"] = probe_flux.summary(record["flux"])
-    say(f"clipped sun: {record['flux_summary']}")
-    record["captures"] = {}
-    for name, path in CAPTURES.items():
-        if name != "kitchen_table" or (probe_captures.DATA / "captures/kitchen_table").is_dir():
-            record["captures"][name] = probe_captures.measure(Path(path), folder / name)
-            say(f"{name}: {record['captures'][name]['sh_rel_err']:.4f}")
-    record["real"] = probe_captures.real(folder)
-    return record
+def captures(folder: Path) -> dict[str, Any]:
+    """The whole chain on captures with truth, those that are there."""
+    there = {"desk": True, "kitchen_table": (probe_captures.DATA / "captures/kitchen_table").is_dir()}
+    return {
+        name: probe_captures.measure(Path(path), folder / name) for name, path in CAPTURES.items() if there[name]
+    }  # fmt: skip
+
+
+PARTS: dict[str, Callable[[Path], Any]] = {
+    "fit": lambda folder: probe_fit.sweep(),
+    "coverage": lambda folder: probe_fit.coverage(100),
+    "unwrap": lambda folder: probe_unwrap.rows(),
+    "speed": lambda folder: probe_unwrap.unwrap_s_24mpx(),
+    "flux": lambda folder: probe_flux.rows(),
+    "captures": captures,
+    "real": probe_captures.real,
+}
 
 
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--parts", default=",".join(PARTS), help="which, with commas; the others are kept as they were")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder")
     given = parser.parse_args()
-    started = time.time()
-
-    def say(text: str) -> None:
-        print(f"{time.time() - started:5.0f} s  {text}", file=sys.stderr, flush=True)  # noqa: T201  a command's progress
-
+    file, wanted = given.out / "probe.json", given.parts.split(",")
+    record = {} if set(wanted) == set(PARTS) else json.loads(file.read_text())
+    record, seconds = {name: record[name] for name in PARTS if name in record}, dict(record.get("seconds", {}))
     with tempfile.TemporaryDirectory() as folder:
-        record = measure(Path(folder), say)
-    threads = len(os.sched_getaffinity(0))
-    record = {**figures(record), "threads": threads, "wall_s": time.time() - started, **record}
+        for name in wanted:
+            started = time.time()
+            record[name] = PARTS[name](Path(folder))
+            seconds[name] = time.time() - started
+            print(f"{seconds[name]:5.0f} s  {name}", file=sys.stderr, flush=True)  # noqa: T201  a command's progress
+    record["flux_summary"] = probe_flux.summary(record["flux"])
+    record = {**figures(record), "threads": len(os.sched_getaffinity(0)), "seconds": seconds, **record}
     given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "probe.json").write_text(json.dumps(record, indent=1) + "\n")
+    file.write_text(json.dumps(record, indent=1) + "\n")
     write_page(record, given.out)
-    say(f"wrote {given.out / 'probe.md'}")
 
 
 if __name__ == "__main__":

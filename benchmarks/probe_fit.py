@@ -136,15 +136,20 @@ def demosaicked(rgb: np.ndarray) -> np.ndarray:
     )
 
 
-def direction_rms_deg(fitted: np.ndarray, true: np.ndarray, radius: float = RADIUS, rim: float = 0.9) -> float:
-    """Error [deg] of mirrored directions over the disc r < ``rim`` of the true silhouette, weighted by its area."""
+def rays_over_disc(centre: np.ndarray, radius: float, rim: float) -> np.ndarray:
+    """Unit rays (2000, 3), evenly over the area of the disc r < ``rim`` of a ball's silhouette."""
     rng = np.random.default_rng(0)
     r, angle = rim * np.sqrt(rng.random(2000)), 2 * np.pi * rng.random(2000)
-    axis = true / np.linalg.norm(true)
+    axis = centre / np.linalg.norm(centre)
     second, first = np.linalg.svd(axis[None])[2][1:]
-    sine = r * radius / np.linalg.norm(true)
+    sine = r * radius / np.linalg.norm(centre)
     spokes = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
-    rays = np.sqrt(1 - sine**2)[:, None] * axis + sine[:, None] * spokes
+    return np.sqrt(1 - sine**2)[:, None] * axis + sine[:, None] * spokes
+
+
+def direction_rms_deg(fitted: np.ndarray, true: np.ndarray, radius: float = RADIUS, rim: float = 0.9) -> float:
+    """Error [deg] of mirrored directions over the disc r < ``rim`` of the true silhouette, weighted by its area."""
+    rays = rays_over_disc(true, radius, rim)
     two = [directions_from_rays(rays, centre, radius) for centre in (fitted, true)]
     return float(np.degrees(np.sqrt(np.nanmean(np.arccos(np.clip((two[0] * two[1]).sum(1), -1, 1)) ** 2))))
 
@@ -187,13 +192,7 @@ def orthographic_rms_deg(camera: Camera, true: np.ndarray, radius: float = RADIU
     px = silhouette(camera, true, radius, azimuths(180))[0]
     solved = np.linalg.lstsq(np.column_stack([2 * px, np.ones(len(px))]), (px**2).sum(1), rcond=None)[0]
     middle, size = solved[:2], np.sqrt(solved[2] + solved[:2] @ solved[:2])
-    rng = np.random.default_rng(0)
-    r, angle = rim * np.sqrt(rng.random(2000)), 2 * np.pi * rng.random(2000)
-    axis = true / np.linalg.norm(true)
-    second, first = np.linalg.svd(axis[None])[2][1:]
-    sine = r * radius / np.linalg.norm(true)
-    spokes = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
-    rays = np.sqrt(1 - sine**2)[:, None] * axis + sine[:, None] * spokes
+    axis, rays = true / np.linalg.norm(true), rays_over_disc(true, radius, rim)
     x, y = ((project(camera, rays) - middle) / size).T
     inside = x**2 + y**2 < 1
     normal = np.stack([x, y, -np.sqrt(np.maximum(1 - x**2 - y**2, 0))], -1)

@@ -171,8 +171,8 @@ def write_page(record: dict[str, Any], folder: Path) -> None:
     lines = [
         "# How right the light is",
         "",
-        f"Made by `make bench-probe` in {record['wall_s'] / 60:.0f} minutes with {record['threads']} threads; every",
-        "figure is in [probe.json](probe.json).",
+        f"Made by `make bench-probe` with {record['threads']} threads, in about ten minutes; every figure is in",
+        "[probe.json](probe.json).",
         "",
         "![errors of directions, irradiance and a clipped sun](probe.svg)",
         "",

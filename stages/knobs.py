@@ -55,7 +55,9 @@ class Probe(Params):
     """From photographs of a probe to an environment map."""
 
     width: int = Field(1024, ge=64, le=8192, description="width of the lat-long [px]; its height is half")
-    supersample: int = Field(3, ge=1, le=16, description="samples per texel and axis")
+    supersample: int = Field(
+        3, ge=1, le=16, description="samples per texel and axis of maps and panoramas; a ball is summed exactly"
+    )
     rim: float = Field(
         0.999, gt=0.5, lt=1, description="outermost radius that may be used, as a fraction of the ball's"
     )

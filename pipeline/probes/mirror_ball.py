@@ -20,6 +20,7 @@ from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, solve_radius
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
+from pipeline.probes.outline import part_of
 from pipeline.probes.parallax import set_down
 from pipeline.probes.reflection import blind_half_angle, deviation, radians_per_pixel
 from pipeline.probes.unwrap import displaced_variance, unwrap
@@ -186,14 +187,7 @@ def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tupl
     px = sphere_fit.silhouette(camera, fit.centre, radius, 2 * np.pi * np.arange(180) / 180)[0]
     low = np.clip(np.floor(px.min(0)).astype(int) - 3, 0, (camera.width - 1, camera.height - 1))
     high = np.clip(np.ceil(px.max(0)).astype(int) + 3, low + 1, (camera.width, camera.height))
-    size = high - low
-    moved = {
-        "cx": camera.cx - int(low[0]),
-        "cy": camera.cy - int(low[1]),
-        "width": int(size[0]),
-        "height": int(size[1]),
-    }
-    return (slice(low[1], high[1]), slice(low[0], high[0])), camera.model_copy(update=moved)
+    return (slice(low[1], high[1]), slice(low[0], high[0])), part_of(camera, low, high)
 
 
 def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:

@@ -68,3 +68,10 @@ def inside(camera: Camera, px: np.ndarray, margin: float = 0.0) -> np.ndarray:
 def azimuths(count: int) -> np.ndarray:
     """``count`` angles evenly around, not starting at zero."""
     return 2 * np.pi * (np.arange(count) + 0.5) / count
+
+
+def part_of(camera: Camera, low: np.ndarray, high: np.ndarray) -> Camera:
+    """The camera of the part of its picture from pixel ``low`` (x, y) up to, not including, ``high``."""
+    width, height = (int(side) for side in high - low)
+    moved = {"cx": camera.cx - int(low[0]), "cy": camera.cy - int(low[1]), "width": width, "height": height}
+    return camera.model_copy(update=moved)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.camera.lens import unproject
 from pipeline.light.sampling import bilinear, planes
-from pipeline.probes.outline import Height, azimuths, inside, radius_in_pixels, silhouette
+from pipeline.probes.outline import Height, azimuths, inside, part_of, radius_in_pixels, silhouette
 from pipeline.types import Camera
 
 SEARCH_AZIMUTHS, SEARCH_RADIUS_PX = 36, 20.0
@@ -221,14 +221,7 @@ def _around(
     limit = np.array([camera.width, camera.height])
     low = np.clip(np.floor(np.nanmin(px, 0)) - 15, 0, limit - 2).astype(int)
     high = np.clip(np.ceil(np.nanmax(px, 0)) + 15, low + 2, limit).astype(int)
-    size = high - low
-    moved = {
-        "cx": camera.cx - int(low[0]),
-        "cy": camera.cy - int(low[1]),
-        "width": int(size[0]),
-        "height": int(size[1]),
-    }
-    return low, signal[low[1] : high[1], low[0] : high[0]], camera.model_copy(update=moved)
+    return low, signal[low[1] : high[1], low[0] : high[0]], part_of(camera, low, high)
 
 
 def coverage(signals: list[np.ndarray], camera: Camera, centre: np.ndarray, radius: float) -> tuple[float, float]:
