@@ -63,7 +63,11 @@ class Raster:
 
 
 class Frame(Record):
-    """One RAW file of a bracket: what its metadata and its manifest say. Nothing here is estimated."""
+    """One photograph of a bracket: what its metadata and its manifest say. Nothing here is estimated.
+
+    A mosaic is (H, W) with a 2x2 ``cfa``; data without one (linear DNG, X-Trans through a demosaic, TIFF, EXR, JPEG) are
+    (H, W, 3) with ``cfa`` empty, and everything that is per CFA cell, (2, 2), is then per channel, (1, 3).
+    """
 
     file: str  # relative to the capture's root
     sha256: str
@@ -73,7 +77,7 @@ class Frame(Record):
     width: int
     height: int
     cfa: str  # colours of the 2x2 cell read in rows, "RGGB"; "" for data that are already (H, W, 3)
-    black: Array  # (2, 2) or (1, 1), DN, in CFA cell order
+    black: Array  # (2, 2) in CFA cell order, (1, 3) of data without one; DN
     white: float  # DN
     camera: str = ""
     timestamp: str = ""
@@ -82,8 +86,15 @@ class Frame(Record):
     illuminant: int = 0  # EXIF LightSource code of ColorMatrix1
     illuminant_2: int = 0
     as_shot_neutral: Array | None = None  # (3,)
+    forward_matrix: Array | None = None  # (3, 3) ForwardMatrix1, XYZ D50 from white balanced camera_rgb
+    forward_matrix_2: Array | None = None
     noise_profile: Array | None = None  # (2,) or (6,): DNG NoiseProfile S, O of signal normalised to [0, 1]
     focal_mm: float = 0.0
+    focal_35mm: float = 0.0
+    lens: str = ""
+    encoding: Literal["linear", "display"] = "linear"  # display: through a response curve nobody states (JPEG, HEIC)
+    space: str = ""  # linear space of data that are no camera_rgb: "linear_rec709", "acescg"; empty: camera_rgb
+    marks: list[str] = []  # what is odd about the file and does not forbid its use, one phrase each
 
 
 class Bracket(Record):
