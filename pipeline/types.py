@@ -65,8 +65,8 @@ class Raster:
 class Frame(Record):
     """One photograph of a bracket: what its metadata and its manifest say. Nothing here is estimated.
 
-    A mosaic is (H, W) with a 2x2 ``cfa``; data without one (linear DNG, X-Trans through a demosaic, TIFF, EXR, JPEG) are
-    (H, W, 3) with ``cfa`` empty, and everything that is per CFA cell, (2, 2), is then per channel, (1, 3).
+    A mosaic is (H, W) with a 2x2 ``cfa``; data without one (linear DNG, X-Trans through a demosaic, TIFF, EXR, JPEG)
+    are (H, W, 3) with ``cfa`` empty, and everything that is per CFA cell, (2, 2), is then per channel, (1, 3).
     """
 
     file: str  # relative to the capture's root
