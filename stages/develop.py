@@ -21,18 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import ACESCG, CLIPPED, DARK
+from pipeline.conventions import ACESCG, CAMERA_RGB, CLIPPED, DARK
 from pipeline.image import colour
 from pipeline.image.demosaic import REACH, Method, demosaic, demosaic_variance, dilate
 from pipeline.image.radiometry import tiled
-from pipeline.run.artifacts import MOSAICS, PHOTOGRAPHS
+from pipeline.run.artifacts import FACTS, MOSAICS, PHOTOGRAPHS
 from pipeline.run.errors import ArtifactError
 from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
 
 
-def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
+def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     """Photographs by view: R G B in radiance units, ACEScg; variance.RGB; mask."""
     profiles = one_white({view: profile_of(view, raster) for view, raster in mosaics.items()})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -43,10 +43,12 @@ def compute(mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     numbers = {view: _numbers(raster) for view, raster in photographs.items()}
     warnings, evidence = [], [_vignetting()]
     plate = plate_profile(profiles)
-    if plate["as_shot_neutral"] is None:
+    if plate["as_shot_neutral"] is None and plate["space"] == CAMERA_RGB:
         warnings.append(f"{plate['file']}: no AsShotNeutral; the scene's white is taken as D65")
     for profile in {profile["camera"]: profile for profile in profiles.values()}.values():
-        if profile["color_matrix_2"] is None:
+        if profile["space"] != CAMERA_RGB:
+            evidence.append(_known_space(profile))
+        elif profile["color_matrix_2"] is None:
             evidence.append(_one_matrix(profile))
         if profile["camera"] != plate["camera"]:
             evidence.append(_other_camera(profile))
@@ -71,6 +73,7 @@ def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:
         raise ArtifactError(f"{view}: mosaic carries no colour profile; run merge again") from error
     for key in ("color_matrix", "color_matrix_2", "as_shot_neutral"):
         profile[key] = None if profile[key] is None else np.array(profile[key], float)
+    profile["space"] = mosaic.space
     return dict(profile)
 
 
@@ -87,6 +90,8 @@ def one_white(profiles: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """
     plate = plate_profile(profiles)
     matrices = ("color_matrix", "color_matrix_2", "illuminant", "illuminant_2")
+    if plate["space"] != CAMERA_RGB:
+        return profiles
     if plate["as_shot_neutral"] is None or plate["color_matrix"] is None:
         return {view: {**p, "as_shot_neutral": plate["as_shot_neutral"]} for view, p in profiles.items()}
     white = colour.camera_white(plate["color_matrix"], plate["as_shot_neutral"], *(plate[k] for k in matrices[1:]))[1]
@@ -98,9 +103,11 @@ def one_white(profiles: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     }
 
 
-def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str) -> Raster:
-    """One view. Raises CaptureError when the file has no usable ColorMatrix."""
-    acescg_from_camera = colour.acescg_from_camera(
+def acescg_of(profile: dict[str, Any], where: str) -> np.ndarray:
+    """(3, 3) from the view's data to ACEScg. Raises CaptureError for camera_rgb without a usable ColorMatrix."""
+    if profile["space"] != CAMERA_RGB:
+        return colour.matrix(profile["space"], "acescg")
+    return colour.acescg_from_camera(
         profile["color_matrix"],
         profile["as_shot_neutral"],
         profile["color_matrix_2"],
@@ -108,20 +115,37 @@ def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str)
         profile["illuminant_2"],
         f"{where} ({profile['file']})",
     )
+
+
+def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str) -> Raster:
+    """One view, a mosaic or data that have all three channels. Raises CaptureError without a usable ColorMatrix."""
+    acescg_from_camera = acescg_of(profile, where)
     cfa = str(mosaic.attributes["insitu:cfa"])
-    # the row sums of the inverse are the camera's response to ACEScg white: the neutral, green = 1
-    neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
-    gains = tiled(np.array([1 / neutral["RGB".index(letter)] for letter in cfa]).reshape(2, 2), mosaic.shape)
-    balanced = mosaic["Y"] * gains
-    variance = mosaic["variance"] * gains * gains
-    mask = _spread_mask(mosaic["mask"], REACH[method])
-    unknown = ~np.isfinite(variance)
-    matrix = acescg_from_camera * neutral  # of white balanced camera_rgb
-    rgb = colour.apply_matrix(matrix, demosaic(balanced, cfa, method))
+    if cfa:
+        # the row sums of the inverse are the camera's response to ACEScg white: the neutral, green = 1
+        neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
+        camera_rgb, variance, mask = _interpolated(mosaic, cfa, neutral, method)
+        matrix = acescg_from_camera * neutral  # of white balanced camera_rgb
+    else:
+        camera_rgb, variance, mask = mosaic.rgb(), mosaic.rgb("variance"), mosaic["mask"]
+        matrix = acescg_from_camera
+    unknown = ~np.isfinite(variance).all(-1) if not cfa else mask & CLIPPED > 0
+    rgb = colour.apply_matrix(matrix, camera_rgb)
     # infinity times a zero coefficient would be NaN: infinite variances are put back after the sums
-    spread = colour.apply_matrix(matrix**2, demosaic_variance(np.where(unknown, 0, variance), cfa, method))
-    spread[mask & CLIPPED > 0] = np.inf
+    spread = colour.apply_matrix(matrix**2, np.where(unknown[..., None], 0, variance))
+    spread[unknown] = np.inf
     return Raster({**Raster.split(rgb), **Raster.split(spread, "variance"), "mask": mask}, ACESCG)
+
+
+def _interpolated(
+    mosaic: Raster, cfa: str, neutral: np.ndarray, method: Method
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """White balanced camera_rgb (H, W, 3) of a mosaic, its variance, and the mask spread by the kernels' reach."""
+    gains = tiled(np.array([1 / neutral["RGB".index(letter)] for letter in cfa]).reshape(2, 2), mosaic.shape)
+    variance = mosaic["variance"] * gains * gains
+    known = np.where(np.isfinite(variance), variance, 0)
+    mask = _spread_mask(mosaic["mask"], REACH[method])
+    return demosaic(mosaic["Y"] * gains, cfa, method), demosaic_variance(known, cfa, method), mask
 
 
 def _spread_mask(mask: np.ndarray, reach: int) -> np.ndarray:
@@ -158,6 +182,15 @@ def _one_matrix(profile: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _known_space(profile: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "term": "colour matrix of the camera",
+        "modelled": False,
+        "because": f"{profile['file']} is not camera_rgb but {profile['space']}, as whoever developed it says",
+        "could_cost": "what that development did to colours: its white balance and its matrix are taken as they are",
+    }
+
+
 def _other_camera(profile: dict[str, Any]) -> dict[str, Any]:
     return {
         "term": f"colour of {profile['camera'] or 'another camera'}",
@@ -167,4 +200,10 @@ def _other_camera(profile: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-STAGE = Stage("develop", compute, knobs.Develop, inputs={"mosaics": MOSAICS}, outputs={"photographs": PHOTOGRAPHS})
+STAGE = Stage(
+    "develop",
+    compute,
+    knobs.Develop,
+    inputs={"facts": FACTS, "mosaics": MOSAICS},
+    outputs={"photographs": PHOTOGRAPHS},
+)

@@ -105,7 +105,7 @@ def capture(tmp_path):
 def run(folder: Path, weights: str = "optimal", method: str = "bilinear"):
     index = ingest.compute(folder, None, knobs.Ingest())
     merged = merge.compute(index.outputs["facts"], index.outputs["brackets"], knobs.Merge(weights=weights))
-    developed = develop.compute(merged.outputs["mosaics"], knobs.Develop(demosaic=method))
+    developed = develop.compute({}, merged.outputs["mosaics"], knobs.Develop(demosaic=method))
     return index, merged, developed
 
 
@@ -168,7 +168,7 @@ def test_results_survive_the_disk(capture, tmp_path):
         (PHOTOGRAPHS, developed.outputs["photographs"]),
     ):
         formats.write(out, artifact, value)
-    again = develop.compute(formats.read(out, MOSAICS), knobs.Develop(demosaic="bilinear"))
+    again = develop.compute({}, formats.read(out, MOSAICS), knobs.Develop(demosaic="bilinear"))
     for view, photograph in formats.read(out, PHOTOGRAPHS).items():
         for name, values in photograph.channels.items():
             np.testing.assert_array_equal(values, again.outputs["photographs"][view][name])
@@ -346,7 +346,7 @@ def test_missing_colour_matrix_is_refused():
     }
     raster.attributes.update({"insitu:cfa": "RGGB", "insitu:colour": json.dumps(profile)})
     with pytest.raises(CaptureError, match=r"a\.nef.*ColorMatrix1"):
-        develop.compute({"plate": raster}, knobs.Develop())
+        develop.compute({}, {"plate": raster}, knobs.Develop())
 
 
 # demosaicking
@@ -416,7 +416,7 @@ def test_clipped_photosites_poison_nothing_beyond_the_kernel():
     header = {"insitu:cfa": "RGGB", "insitu:colour": json.dumps(profile)}
     raster = Raster({"Y": mosaic, "variance": variance, "mask": mask}, "camera_rgb", header)
     for method in ("bilinear", "malvar"):
-        result = develop.compute({"plate": raster}, knobs.Develop(demosaic=method)).outputs["photographs"]["plate"]
+        result = develop.compute({}, {"plate": raster}, knobs.Develop(demosaic=method)).outputs["photographs"]["plate"]
         infinite = np.isinf(result.rgb("variance")).all(-1)
         side = 2 * REACH[method] + 1
         assert infinite.sum() == side * side

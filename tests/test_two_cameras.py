@@ -93,7 +93,7 @@ def test_raw_files_of_two_bodies_come_to_one_radiance(folder):
     index = ingest.compute(folder, None, knobs.Ingest()).outputs
     merged = merge.compute(index["facts"], index["brackets"], knobs.Merge())
     assert any(text.startswith("ball: neither static scene nor exposure setting ties it") for text in merged.warnings)
-    developed = develop.compute(merged.outputs["mosaics"], knobs.Develop(demosaic="bilinear"))
+    developed = develop.compute({}, merged.outputs["mosaics"], knobs.Develop(demosaic="bilinear"))
     shots = developed.outputs["photographs"]
     assert {view: shot.shape for view, shot in shots.items()} == SIZES
     # its own matrices and the plate's white: colours differ by the sensitivity alone, whatever its white balance says

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.conventions import ACESCG, CAMERA_RGB, RADIANCE_UNIT
-from pipeline.run.stage import Artifact
+from pipeline.conventions import ACESCG, RADIANCE_UNIT
+from pipeline.run.stage import STATED, Artifact
 from pipeline.types import Balance, BallFit, Bracket, Camera, Emitter, Harmonics, Occluder, Plane, Proxy, Surface, View
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
@@ -20,9 +20,10 @@ OCCLUDERS = Artifact("occluders", "json", "real things before the objects: meshe
 MOSAICS = Artifact(
     "mosaics",
     "rasters",
-    "merged bracket of each view before demosaicking: Y, variance, mask",
+    "merged bracket of each view: Y, variance, mask before demosaicking (camera_rgb); of data without a mosaic R G B, "
+    "variance.RGB, mask",
     RADIANCE_UNIT,
-    CAMERA_RGB,
+    STATED,
 )
 EXPOSURES = Artifact(
     "exposures",

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.conventions import ACESCG
 from pipeline.run.errors import ArtifactError
-from pipeline.run.stage import Artifact
+from pipeline.run.stage import STATED, Artifact
 from pipeline.types import Raster
 
 AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
@@ -238,8 +238,12 @@ def write(folder: Path, artifact: Artifact, value: Any) -> Path:
 
 
 def _check(path: Path, artifact: Artifact, raster: Raster) -> None:
-    if raster.space != artifact.space:
+    if artifact.space not in (STATED, raster.space):
         raise ArtifactError(f"{path}: stage wrote colour space {raster.space}, declared {artifact.space}")
+
+
+def _space(artifact: Artifact) -> str | None:
+    return None if artifact.space == STATED else artifact.space
 
 
 def read(folder: Path, artifact: Artifact) -> Any:
@@ -255,9 +259,9 @@ def read(folder: Path, artifact: Artifact) -> Any:
         except ValidationError as error:
             raise ArtifactError(f"{path}: does not read as {artifact.name} ({error.error_count()} problems)") from error
     if artifact.kind == "raster":
-        return read_exr(path, artifact.space)
+        return read_exr(path, _space(artifact))
     if artifact.kind == "rasters":
-        return {file.stem: read_exr(file, artifact.space) for file in sorted(path.glob("*.exr"))}
+        return {file.stem: read_exr(file, _space(artifact)) for file in sorted(path.glob("*.exr"))}
     if artifact.kind == "picture":
         return read_png(path)
     return path.read_text()

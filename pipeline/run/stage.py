@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+STATED = "stated"  # space of an artifact whose rasters each say their own
+
 
 @dataclass(frozen=True)
 class Artifact:
