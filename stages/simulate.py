@@ -94,8 +94,9 @@ def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> No
     for model in scene.object:
         shapes.write_glb(out / "objects" / f"{model.name}.glb", shapes.build(model), model)
     capture.write_manifests(scene, out)
-    views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view]}
+    views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view, *scene.view]}
     take_calibration(studio, shoot, progress)
+    take_views(studio, shoot, progress)
     pictures = {view.name: ball_picture(studio, view, progress) for view in scene.ball_view}
     pictures["plate"], noise = plate_truth(studio, out, progress)
     capture.take_brackets(shoot, pictures)
@@ -108,6 +109,7 @@ def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> No
 def board_pose(scene: SimulatedScene, lens: Lens, photo: BoardPhoto) -> np.ndarray:
     """world_from_camera of a calibration photograph."""
     board = scene.board
+    assert board is not None  # the scene file has been validated: calibration needs a board
     centre = np.array([board.squares[0] * board.square_m / 2, 0.0, board.squares[1] * board.square_m / 2])
     tilt, azimuth = np.radians(photo.tilt_deg), np.radians(photo.azimuth_deg)
     offset = np.array([np.sin(tilt) * np.sin(azimuth), np.cos(tilt), np.sin(tilt) * np.cos(azimuth)])
@@ -125,6 +127,18 @@ def take_calibration(studio: Studio, shoot: capture.Shoot, progress: Callable[[s
         raw = studio.photograph(measure, pose, studio.scene.sampling.calibration, 900_000 + 1000 * number)
         data = capture.srgb_jpeg(blur(raw, studio.scene.camera.blur_sigma_px), shoot.sensor, number)
         write_bytes(shoot.out / "calibration" / f"calib_{number:02d}.jpg", data)
+
+
+def take_views(studio: Studio, shoot: capture.Shoot, progress: Callable[[str], None]) -> None:
+    """The further photographs."""
+    scene = studio.scene
+    measure = studio.radiance()
+    for number, view in enumerate(scene.view):
+        progress(f"photograph {number + 1} of {len(scene.view)}")
+        raw = studio.photograph(measure, studio.pose(view), scene.sampling.calibration, 800_000 + 1000 * number)
+        exif = capture.lens_exif(scene.camera)
+        data = capture.srgb_jpeg(blur(raw, scene.camera.blur_sigma_px), shoot.sensor, 1000 + number, "view", exif)
+        write_bytes(shoot.out / "views" / f"{view.name}.jpg", data)
 
 
 def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None]) -> np.ndarray:
@@ -145,7 +159,7 @@ def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None
     base = mirrored_radiance(studio.mi, dark, sampling.depth, ball, scene.ball.reflectance)
     black = studio.photograph(base, pose, sampling.ball, seed)
     cover = studio.photograph(first_hit(studio.mi, dark, [ball]), pose, sampling.pass_samples, seed)
-    surfaces = surface_albedo(studio.mi, dark, list(place.table_and_board().values()))
+    surfaces = surface_albedo(studio.mi, dark, list(place.table_and_prints().values()))
     albedo = studio.photograph(surfaces, pose, sampling.pass_samples, seed)
     thrown = spread_light(mirror - black, albedo, cover)
     return blur(black + thrown, scene.camera.blur_sigma_px)
@@ -173,12 +187,13 @@ def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> t
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
     pose, sigma = studio.pose(scene.plate), studio.scene.camera.blur_sigma_px
     people, objects = place.photographer(pose), place.objects()
-    with_scene = place.load(people, objects)
+    prints = not scene.bare_plate
+    with_scene = place.load(people, objects, prints=prints)
     progress("coverage of the objects")
     hits = first_hit(studio.mi, with_scene, list(objects.values()))
     seen = studio.photograph(hits, pose, 4 * sampling.pass_samples, 50_000) if objects else np.zeros((*studio.shape, 0))
     coverage = blur(seen, sigma)
-    plate = path_radiance(studio.mi, place.load(people), sampling.depth)
+    plate = path_radiance(studio.mi, place.load(people, prints=prints), sampling.depth)
     filled = path_radiance(studio.mi, with_scene, sampling.depth)
     progress(f"plate and with_objects: whole picture, {sampling.plate} samples")
     raw = {"plate": studio.photograph(plate, pose, sampling.plate, 1)}
@@ -292,8 +307,9 @@ def surface_truth(studio: Studio, out: Path, pose: np.ndarray, progress: Callabl
     """Write albedo.exr (as the plate's camera sees it) and environment.exr (at the ball's centre)."""
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
     progress("albedo and environment")
-    surfaces = place.table_and_board()
-    albedo = surface_albedo(studio.mi, place.load(), list(surfaces.values()))
+    prints = not scene.bare_plate
+    surfaces = place.table_and_prints(prints)
+    albedo = surface_albedo(studio.mi, place.load(prints=prints), list(surfaces.values()))
     pixels = blur(studio.photograph(albedo, pose, sampling.pass_samples, 60_000), scene.camera.blur_sigma_px)
     capture.write_picture(out / "truth" / "albedo.exr", pixels[..., :3], {"seen": pixels[..., 3]}, "1")
     height, width = sampling.environment_width // 2, sampling.environment_width

@@ -431,7 +431,7 @@ def test_white_furnace_shows_the_albedo() -> None:
     rays = camera_rays(mi, lens, look_at(np.array(scene.plate.position_m), np.array(scene.plate.target_m)))
     seen = picture(mi, rays, path_radiance(mi, place.load(), 4), (48, 64), 64, 64, 1)
     albedo = picture(
-        mi, rays, surface_albedo(mi, place.load(), list(place.table_and_board().values())), (48, 64), 64, 64, 1
+        mi, rays, surface_albedo(mi, place.load(), list(place.table_and_prints().values())), (48, 64), 64, 64, 1
     )
     assert (albedo[..., 3] == 1).all()
     # the room is sampled with a relative scatter of at most 0.6 per sample: 3072 pixels x 64 samples
@@ -444,6 +444,7 @@ def test_calibration_photographs_show_the_board() -> None:
     scene = desk_scene()
     lens = capture.lens_of(scene.camera)
     board = scene.board
+    assert board is not None
     grid = [[(i + 1) * board.square_m, 0.0, (j + 1) * board.square_m] for j in range(4) for i in range(6)]
     assert len(scene.calibration) == 10
     for photo in scene.calibration:

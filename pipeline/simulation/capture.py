@@ -25,7 +25,7 @@ from pipeline.types import Raster
 UNIT = (
     "(DN-black)/(white-black)*N^2*100/(t*ISO) with the true times; ACEScg (1,1,1) gives green the value 1 in camera_rgb"
 )
-JPEG_QUALITY = 95
+JPEG_QUALITY = {"calibration": (95, 0), "view": (90, 2)}  # quality, and chroma subsampling as Pillow counts it
 
 
 def lens_of(camera: CameraModel) -> Lens:
@@ -103,7 +103,7 @@ def take_brackets(shoot: Shoot, pictures: dict[str, np.ndarray]) -> None:
             shoot.take(f"{name}/{name}_{frame + 1}.dng", pictures[name], third)
 
 
-def srgb_jpeg(acescg: np.ndarray, sensor: Sensor, seed: int) -> bytes:
+def srgb_jpeg(acescg: np.ndarray, sensor: Sensor, seed: int, kind: str = "calibration", exif: bytes = b"") -> bytes:
     """A developed photograph: exposed to its own brightest, sensor noise, sRGB, JPEG."""
     from PIL import Image
 
@@ -115,8 +115,19 @@ def srgb_jpeg(acescg: np.ndarray, sensor: Sensor, seed: int) -> bytes:
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
     stream = io.BytesIO()
     picture = Image.fromarray(np.rint(encoded * 255).astype(np.uint8))
-    picture.save(stream, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    quality, subsampling = JPEG_QUALITY[kind]
+    picture.save(stream, "JPEG", quality=quality, subsampling=subsampling, **({"exif": exif} if exif else {}))
     return stream.getvalue()
+
+
+def lens_exif(camera: CameraModel) -> bytes:
+    """EXIF of a photograph: make, model and focal length, also as if on 35 mm film by a sensor 36 mm wide."""
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = camera.make, camera.model
+    exif.get_ifd(0x8769).update({0x920A: camera.focal_mm, 0xA405: round(camera.focal_mm)})
+    return exif.tobytes()
 
 
 def write_picture(path: Path, rgb: np.ndarray, extra: dict[str, np.ndarray] | None = None, unit: str = UNIT) -> None:
@@ -163,7 +174,16 @@ def capture_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]
             "reflectance_space": ACESCG,
         },
     )
-    yield "[board]", scene.board.model_dump()
+    if scene.board is not None:
+        yield "[board]", scene.board.model_dump()
+    for marker in scene.marker:
+        yield "[[marker]]", {key: getattr(marker, key) for key in ("dictionary", "id", "side_m")}
+    if scene.view:
+        yield "[views]", {"files": ["views/*.jpg"]}
+        for name in ["plate", *[view.name for view in scene.ball_view if view.position_m is not None]]:
+            yield "[[pose]]", {"view": name, "route": "colmap"}
+    if scene.view and not scene.calibration:
+        return
     if scene.calibration:
         yield "[camera]", {"calibration": ["calibration/*.jpg"]}
     else:

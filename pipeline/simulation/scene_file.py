@@ -82,8 +82,9 @@ class LightFacts(Strict):
 
 
 class TableFacts(Strict):
-    """The table top, y = 0: procedural wood, diffuse, or glossy by the glTF material when roughness is given."""
+    """The table top, y = 0: procedural wood or terrazzo, diffuse, or glossy by the glTF material with a roughness."""
 
+    pattern: Literal["wood", "terrazzo"] = "wood"
     x_m: Span
     z_m: Span
     texel_m: float = Field(0.0005, gt=0)
@@ -98,6 +99,26 @@ class PrintFacts(Strict):
     paper: Rgb = (0.80, 0.80, 0.79)
     ink: Rgb = (0.04, 0.04, 0.042)
     px_per_mm: float = Field(7.0, gt=0)
+
+
+class MarkerModel(Strict):
+    """A printed marker on the table, its sides along x and z; the first of them lies at the origin of the world."""
+
+    dictionary: str = "DICT_5X5_100"
+    id: int = Field(ge=0)
+    side_m: float = Field(gt=0)
+    margin_m: float = Field(0.01, gt=0, description="white paper around it")
+    position_m: Span = Field((0.0, 0.0), description="x, z of its centre")
+
+
+class BoxModel(Strict):
+    """A real box that stands on the table in every photograph, speckled."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    position_m: Span = Field(description="x, z of its middle")
+    size_m: Point = Field(description="along its x, y, z")
+    yaw_deg: float = 0.0
+    albedo: Rgb
 
 
 class BallModel(Strict):
@@ -209,19 +230,33 @@ class SimulatedScene(Strict):
     sensor: SensorModel
     light: LightFacts
     table: TableFacts
-    board: BoardFacts
+    board: BoardFacts | None = None
     board_print: PrintFacts = PrintFacts()
+    marker: list[MarkerModel] = Field([], description="instead of a board")
+    bare_plate: bool = Field(False, description="board and markers are taken away before the plate")
+    box: list[BoxModel] = Field([])
     ball: BallModel
     plate: ViewFacts
     ball_view: list[ViewFacts] = Field(min_length=1)
+    view: list[ViewFacts] = Field([], description="further photographs, as JPEG: they orient the others")
     object: list[ObjectModel] = Field([], description="what really stands there in the truth")
-    calibration: list[BoardPhoto] = Field([], description="none: capture.toml gives the intrinsics")
+    calibration: list[BoardPhoto] = Field(
+        [], description="without them capture.toml gives the intrinsics, or leaves them to the further photographs"
+    )
     bracket: BracketFacts = BracketFacts()
     sampling: SamplingFacts = SamplingFacts()
 
     @model_validator(mode="after")
     def _consistent(self) -> SimulatedScene:
-        names = [self.plate.name, *[view.name for view in self.ball_view]]
+        names = [self.plate.name, *[view.name for view in [*self.ball_view, *self.view]]]
+        if (self.board is None) == (not self.marker):
+            raise ValueError("expected either [board] or [[marker]]")
+        if self.marker and self.marker[0].position_m != (0.0, 0.0):
+            raise ValueError(f"marker[0].position_m is {self.marker[0].position_m}; it defines the origin")
+        if self.calibration and self.board is None:
+            raise ValueError("calibration: photographs of a board, and there is no [board]")
+        if any(view.position_m is None for view in self.view):
+            raise ValueError("view: has no position_m; it is required")
         if names[0] != "plate" or len(set(names)) < len(names):
             raise ValueError(f"views are {names}; expected 'plate' first and unique names")
         if self.plate.position_m is None:

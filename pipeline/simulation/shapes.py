@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.simulation.scene_file import Lathe, ObjectModel, Sphere, Torus
+from pipeline.simulation.scene_file import BoxModel, Lathe, ObjectModel, Sphere, Torus
 
 Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices (N, 3), unit normals (N, 3), faces (M, 3)
 
@@ -100,3 +100,26 @@ def write_glb(path: Path, mesh: Mesh, model: ObjectModel) -> None:
     path.write_bytes(
         export_glb(trimesh.Scene(dict[str, trimesh.parent.Geometry]({model.name: solid})), include_normals=True)
     )
+
+
+def standing_box(model: BoxModel) -> tuple[Mesh, np.ndarray]:
+    """Four sides and the top of a box in the world frame, and uv (N, 2) into `surfaces.box_texture`."""
+    width, height, depth = model.size_m
+    around, high = 2 * (width + depth), height + depth
+    corners = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * np.array([width, depth]) / 2  # x, z: front, right, ...
+    lengths = np.array([0, width, depth, width, depth]).cumsum()
+    vertices, normals, uv = [], [], []
+    for side in range(4):
+        (x0, z0), (x1, z1) = corners[side], corners[(side + 1) % 4]
+        vertices += [[x0, 0, z0], [x1, 0, z1], [x1, height, z1], [x0, height, z0]]
+        normals += [[[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]][side]] * 4
+        u0, u1, v1 = lengths[side] / around, lengths[side + 1] / around, height / high
+        uv += [[u0, 0], [u1, 0], [u1, v1], [u0, v1]]
+    vertices += [[x, height, z] for x, z in corners]
+    normals += [[0, 1, 0]] * 4
+    uv += [[0, height / high], [width / around, height / high], [width / around, 1], [0, 1]]
+    faces = np.concatenate([4 * np.arange(5)[:, None] + np.array(part) for part in ((0, 1, 2), (0, 2, 3))])
+    cosine, sine = np.cos(np.radians(model.yaw_deg)), np.sin(np.radians(model.yaw_deg))
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    placed = np.array(vertices, float) @ turn.T + [model.position_m[0], 0, model.position_m[1]]
+    return (placed, np.array(normals, float) @ turn.T, faces), np.array(uv, float)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.run.manifest import BoardFacts
-from pipeline.simulation.scene_file import PrintFacts, TableFacts
+from pipeline.simulation.scene_file import BoxModel, MarkerModel, PrintFacts, TableFacts
 
 
 def value_noise(x: np.ndarray, z: np.ndarray, seed: int) -> np.ndarray:
@@ -41,13 +41,29 @@ def wood_albedo(
     return colour * (1 + warm[..., None] * np.array([1.0, -0.1, -0.9]))
 
 
+def speckled_albedo(
+    x: np.ndarray, z: np.ndarray, albedo: tuple[float, float, float], contrast: float, seed: int
+) -> np.ndarray:
+    """(..., 3) albedo of terrazzo: chips of three sizes (3 to 12 mm) of many tones in an even ground."""
+    tone = np.ones((*np.broadcast(x, z).shape, 3))
+    for number, per_metre in enumerate((85.0, 160.0, 330.0)):
+        cell = value_noise(x * per_metre, z * per_metre, seed + 10 + number)
+        chip = np.clip((cell - 0.60) / 0.05, 0, 1)[..., None]
+        shades = [value_noise(x * per_metre / 2.3, z * per_metre / 2.3, seed + 20 + 3 * number + c) for c in range(3)]
+        grey = shades[0][..., None]
+        chip_tone = 1 + contrast * (1.9 * (grey - 0.5) + 0.35 * (np.stack(shades, -1) - grey))
+        tone = tone * (1 - chip) + chip * chip_tone
+    return np.asarray(albedo) * tone
+
+
 def table_texture(table: TableFacts, seed: int) -> np.ndarray:
     """(H, W, 3) float32 of the whole table top, checked to lie in [0.02, 0.95]."""
     columns = max(2, round((table.x_m[1] - table.x_m[0]) / table.texel_m))
     rows = max(2, round((table.z_m[1] - table.z_m[0]) / table.texel_m))
     x = table.x_m[0] + (np.arange(columns) + 0.5) / columns * (table.x_m[1] - table.x_m[0])
     z = table.z_m[0] + (np.arange(rows) + 0.5) / rows * (table.z_m[1] - table.z_m[0])
-    texture = wood_albedo(x[None, :] + 0 * z[:, None], z[:, None] + 0 * x[None, :], table.albedo, table.contrast, seed)
+    pattern = wood_albedo if table.pattern == "wood" else speckled_albedo
+    texture = pattern(x[None, :] + 0 * z[:, None], z[:, None] + 0 * x[None, :], table.albedo, table.contrast, seed)
     if not (texture.min() >= 0.02 and texture.max() <= 0.95):
         raise ValueError(f"table: albedo reaches {texture.min():.3f} to {texture.max():.3f}; expected 0.02 to 0.95")
     return texture.astype(np.float32)
@@ -66,3 +82,24 @@ def board_texture(board: BoardFacts, paper: PrintFacts) -> np.ndarray:
     print_size = (board.squares[0] * square, board.squares[1] * square)
     white = np.pad(layout.generateImage(print_size, marginSize=0, borderBits=1), margin, constant_values=255) / 255.0
     return (np.asarray(paper.ink) + white[..., None] * (np.asarray(paper.paper) - paper.ink)).astype(np.float32)
+
+
+def marker_texture(marker: MarkerModel, paper: PrintFacts) -> np.ndarray:
+    """(H, W, 3) float32 of a marker with its paper margin."""
+    import cv2
+
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, marker.dictionary))
+    cells = dictionary.markerSize + 2
+    side = cells * max(1, round(marker.side_m * 1000 * paper.px_per_mm / cells))
+    margin = round(side * marker.margin_m / marker.side_m)
+    bits = cv2.aruco.generateImageMarker(dictionary, marker.id, side, borderBits=1)
+    white = np.pad(bits, margin, constant_values=255) / 255.0
+    return (np.asarray(paper.ink) + white[..., None] * (np.asarray(paper.paper) - paper.ink)).astype(np.float32)
+
+
+def box_texture(box: BoxModel, texel_m: float, seed: int) -> np.ndarray:
+    """(H, W, 3) float32 around the four sides of a box, and its top below them; checked to lie in [0.02, 0.95]."""
+    width, height, depth = box.size_m
+    u = (np.arange(round(2 * (width + depth) / texel_m)) + 0.5) * texel_m
+    v = (np.arange(round((height + depth) / texel_m)) + 0.5) * texel_m
+    return np.clip(speckled_albedo(u[None, :], v[:, None], box.albedo, 0.9, seed), 0.02, 0.95).astype(np.float32)

@@ -15,7 +15,7 @@ from pipeline.simulation import light, shapes, spectra, surfaces
 from pipeline.simulation.photograph import Measure
 from pipeline.simulation.scene_file import ObjectModel, SimulatedScene
 from pipeline.simulation.sensor import ACES_WHITE_XY, AP1_XY, acescg_from_rec709, xyz_from_rgb
-from pipeline.simulation.world import Place, mesh, rectangles
+from pipeline.simulation.world import Place, mesh
 
 BINS = 1 << 14  # of the table of wavelengths
 UNIFORM_SHARE = 0.3  # of the wavelengths; the rest goes where the curves are
@@ -186,30 +186,9 @@ class Twin(Place):
         common = {"type": "bitmap", "filter_type": "bilinear", "wrap_mode": "clamp"}
         if self.maps is not None:
             return {**common, "data": self.mi.TensorXf(self.maps[name].astype(np.float32)), "raw": True}
-        made = {
-            "table": lambda: surfaces.table_texture(self.scene.table, self.scene.seed),
-            "board": lambda: surfaces.board_texture(self.scene.board, self.scene.board_print),
-        }[name]()
+        is_table = name == "table"
+        made = surfaces.table_texture(self.scene.table, self.scene.seed) if is_table else self.print_pixels(name)
         return {**common, "bitmap": self.mi.Bitmap(rec709(made))}
-
-    def table_and_board(self) -> dict[str, Any]:
-        """As the simulator's, with this world's textures."""
-        if self._surfaces:
-            return self._surfaces
-        table = self.scene.table
-        whole = (table.x_m[0], table.z_m[0], table.x_m[1], table.z_m[1])
-        x0, z0, x1, z1 = paper = self.paper()
-        around = [(*whole[:3], z0), (whole[0], z1, *whole[2:]), (whole[0], z0, x0, z1), (x1, z0, whole[2], z1)]
-        for name, spans, extent in (("table", around, whole), ("board", [paper], paper)):
-            bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": self.pixels(name)}
-            if name == "table" and table.roughness is not None:
-                bsdf = {
-                    "type": "insitu_gltf", "base_color": bsdf["reflectance"], "metallic": 0.0,
-                    "roughness": table.roughness,
-                }  # fmt: skip
-            parts, uv = rectangles(spans, extent)
-            self._surfaces[name] = mesh(self.mi, name, parts, self.mi.load_dict(bsdf), uv, smooth=False)
-        return self._surfaces
 
     def base(self, patch: str) -> dict[str, Any]:
         """Reflectance of a measured patch."""

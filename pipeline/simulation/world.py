@@ -5,6 +5,7 @@ Everything is given to Mitsuba as ACEScg arrays (raw textures); its rgb variants
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,13 +63,31 @@ def rectangles(spans: list[tuple[float, float, float, float]], whole: tuple[floa
     return (vertices, np.tile([0.0, 1.0, 0.0], (len(vertices), 1)), faces), uv
 
 
+Rectangle = tuple[float, float, float, float]  # x0, z0, x1, z1
+
+
+def around(whole: Rectangle, holes: list[Rectangle]) -> list[Rectangle]:
+    """Rectangles that fill ``whole`` but for the holes in it, without overlap: strips along x between all edges."""
+    edges = sorted({whole[1], whole[3], *(z for hole in holes for z in (hole[1], hole[3]))})
+    filled = []
+    for low, high in itertools.pairwise(edges):
+        x = whole[0]
+        for hole in sorted(hole for hole in holes if hole[1] < high and hole[3] > low):
+            filled.append((x, low, hole[0], high))
+            x = hole[2]
+        filled.append((x, low, whole[2], high))
+    return filled
+
+
 @dataclass
 class Place:
     """Builds the scenes of one simulation; textures are made once."""
 
     mi: Any
     scene: SimulatedScene
-    _surfaces: dict[str, Any] = field(default_factory=dict)
+    _surfaces: dict[bool, dict[str, Any]] = field(default_factory=dict)
+    _materials: dict[str, Any] = field(default_factory=dict)
+    _boxes: dict[str, Any] = field(default_factory=dict)
 
     @property
     def ball_centre(self) -> np.ndarray:
@@ -76,38 +95,64 @@ class Place:
         x, z = self.scene.ball.position_m
         return np.array([x, self.scene.ball.diameter_m / 2, z])
 
-    def paper(self) -> tuple[float, float, float, float]:
-        """(x0, z0, x1, z1) of the printed sheet."""
-        board = self.scene.board
-        margin = board.margin_m
-        return (
-            -margin,
-            -margin,
-            board.squares[0] * board.square_m + margin,
-            board.squares[1] * board.square_m + margin,
-        )
+    def prints(self) -> dict[str, tuple[float, float, float, float]]:
+        """(x0, z0, x1, z1) of every printed sheet, its margin included."""
+        scene = self.scene
+        sheets = {}
+        if scene.board is not None:
+            margin, square = scene.board.margin_m, scene.board.square_m
+            x, z = (count * square + margin for count in scene.board.squares)
+            sheets["board"] = (-margin, -margin, x, z)
+        for number, marker in enumerate(scene.marker):
+            (x, z), half = marker.position_m, marker.side_m / 2 + marker.margin_m
+            sheets[f"marker_{number}"] = (x - half, z - half, x + half, z + half)
+        return sheets
 
-    def table_and_board(self) -> dict[str, Any]:
-        """The table top around the sheet, and the sheet, in one plane: no gap, no overlap."""
-        if self._surfaces:
-            return self._surfaces
+    def print_pixels(self, name: str) -> np.ndarray:
+        """(H, W, 3) albedo of a printed sheet."""
+        scene = self.scene
+        if name == "board" and scene.board is not None:
+            return surfaces.board_texture(scene.board, scene.board_print)
+        return surfaces.marker_texture(scene.marker[int(name.removeprefix("marker_"))], scene.board_print)
+
+    def pixels(self, name: str) -> dict[str, Any]:
+        """The texture of the table or of a printed sheet."""
+        if name == "table":
+            return texture(self.mi, surfaces.table_texture(self.scene.table, self.scene.seed))
+        return texture(self.mi, self.print_pixels(name))
+
+    def table_and_prints(self, prints: bool = True) -> dict[str, Any]:
+        """The table top and, let into it, the printed sheets: one plane, no gap, no overlap."""
+        if prints in self._surfaces:
+            return self._surfaces[prints]
         mi, table = self.mi, self.scene.table
-        x0, z0, x1, z1 = whole = (table.x_m[0], table.z_m[0], table.x_m[1], table.z_m[1])
-        px0, pz0, px1, pz1 = paper = self.paper()
-        around = [(x0, z0, x1, pz0), (x0, pz1, x1, z1), (x0, pz0, px0, pz1), (px1, pz0, x1, pz1)]
-        wood = texture(mi, surfaces.table_texture(table, self.scene.seed))
-        if table.roughness is None:
-            material: dict[str, Any] = {"type": "diffuse", "reflectance": wood}
-        else:
-            material = {"type": "insitu_gltf", "base_color": wood, "metallic": 0.0, "roughness": table.roughness}
-        print_pixels = surfaces.board_texture(self.scene.board, self.scene.board_print)
-        for name, spans, extent, bsdf in (
-            ("table", around, whole, material),
-            ("board", [paper], paper, {"type": "diffuse", "reflectance": texture(mi, print_pixels)}),
-        ):
-            parts, uv = rectangles(spans, extent)
-            self._surfaces[name] = mesh(mi, name, parts, mi.load_dict(bsdf), uv, smooth=False)
-        return self._surfaces
+        whole = (table.x_m[0], table.z_m[0], table.x_m[1], table.z_m[1])
+        sheets = self.prints() if prints else {}
+        if not self._materials:
+            for name in ["table", *self.prints()]:
+                material: dict[str, Any] = {"type": "diffuse", "reflectance": self.pixels(name)}
+                if name == "table" and table.roughness is not None:
+                    gloss = {"metallic": 0.0, "roughness": table.roughness}
+                    material = {"type": "insitu_gltf", "base_color": material["reflectance"], **gloss}
+                self._materials[name] = mi.load_dict(material)
+        made = {}
+        parts = {"table": (around(whole, list(sheets.values())), whole)}
+        parts |= {name: ([sheet], sheet) for name, sheet in sheets.items()}
+        for name, (spans, extent) in parts.items():
+            shape, uv = rectangles(spans, extent)
+            made[name] = mesh(mi, name, shape, self._materials[name], uv, smooth=False)
+        self._surfaces[prints] = made
+        return made
+
+    def boxes(self) -> dict[str, Any]:
+        """The real boxes; made once."""
+        if not self._boxes:
+            for number, model in enumerate(self.scene.box):
+                pixels = surfaces.box_texture(model, self.scene.table.texel_m, self.scene.seed + 100 + number)
+                bsdf = self.mi.load_dict({"type": "diffuse", "reflectance": texture(self.mi, pixels)})
+                parts, uv = shapes.standing_box(model)
+                self._boxes[f"box_{model.name}"] = mesh(self.mi, model.name, parts, bsdf, uv, smooth=False)
+        return self._boxes
 
     def room(self) -> dict[str, Any]:
         """The distant light."""
@@ -166,9 +211,9 @@ class Place:
             made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, self.mi.load_dict(bsdf))
         return made
 
-    def load(self, *parts: dict[str, Any]) -> Any:
-        """A Mitsuba scene of the table, the board, the room and the given parts."""
-        scene: dict[str, Any] = {"type": "scene", **self.table_and_board(), **self.room()}
+    def load(self, *parts: dict[str, Any], prints: bool = True) -> Any:
+        """A Mitsuba scene of the table, the printed sheets on it, the boxes, the room and the given parts."""
+        scene: dict[str, Any] = {"type": "scene", **self.table_and_prints(prints), **self.boxes(), **self.room()}
         for part in parts:
             scene.update(part)
         return self.mi.load_dict(scene)
