@@ -94,6 +94,7 @@ class Frame(Record):
     lens: str = ""
     encoding: Literal["linear", "display"] = "linear"  # display: through a response curve nobody states (JPEG, HEIC)
     space: str = ""  # linear space of data that are no camera_rgb: "linear_rec709", "acescg"; empty: camera_rgb
+    nd_stops: float = 0.0  # of a neutral filter before the lens, as stated; exposure_s and fnumber do not hold it
     marks: list[str] = []  # what is odd about the file and does not forbid its use, one phrase each
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from pipeline.run.errors import ManifestError
+from pipeline.run.noise_facts import NoiseFacts
 from pipeline.run.probe_facts import BALL_KINDS, PROBE_KINDS, ProbeFacts
 from pipeline.run.strict import Coordinate, Length, Matrix4, Rgb, Share, Strict
 
@@ -86,12 +87,13 @@ class PoseFacts(Strict):
 
 
 class ExposureFacts(Strict):
-    """Exposure of files whose EXIF is missing or wrong."""
+    """Exposure of files whose EXIF is missing or wrong, and the filter, which EXIF never tells."""
 
     files: list[str]
     exposure_s: float | None = Field(None, gt=0)
     iso: float | None = Field(None, gt=0)
     fnumber: float | None = Field(None, gt=0)
+    nd_stops: float | None = Field(None, ge=0, le=30, description="of a neutral density filter on the lens")
 
 
 class ProxyFacts(Strict):
@@ -188,6 +190,7 @@ class CaptureFacts(Strict):
     camera: CameraFacts = CameraFacts()
     pose: list[PoseFacts] = Field([])
     exposure: list[ExposureFacts] = Field([])
+    noise: list[NoiseFacts] = Field([])
     proxy: list[ProxyFacts] = Field([])
     room: RoomFacts | None = None
     occluder: list[OccluderFacts] = Field([])
@@ -214,6 +217,9 @@ class CaptureFacts(Strict):
         strange = sorted({seen.view for one in self.reference for seen in one.seen} - shown)
         if strange:
             raise ValueError(f"reference.seen.view is {strange}; expected one of {sorted(shown)}")
+        sensors = [(noise.camera, noise.iso) for noise in self.noise]
+        if len(set(sensors)) < len(sensors):
+            raise ValueError(f"noise is given for (camera, ISO) {sensors}; expected each pair once")
         for kind, tables in (("proxy", self.proxy), ("occluder", self.occluder), ("reference", self.reference)):
             given = [table.name for table in tables]
             if len(set(given)) < len(given):
