@@ -26,7 +26,8 @@ from pydantic import ValidationError
 
 from pipeline.image.colour import convert
 from pipeline.image.exposure import exposure_of
-from pipeline.image.raw import file_sha256, read_metadata
+from pipeline.image.frames import read_frame
+from pipeline.image.raw import file_sha256
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_latlong, read_linear, read_mask
@@ -273,7 +274,7 @@ def _brackets(
 
     def read(path: Path) -> Frame | str:
         try:
-            return read_metadata(path, path.relative_to(root).as_posix())
+            return read_frame(path, path.relative_to(root).as_posix())
         except CaptureError as error:
             return str(error)
 

@@ -26,9 +26,9 @@ import numpy as np
 from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
 from pipeline.image import exposure, noise, radiometry, tripod
 from pipeline.image.exposure import Ratio
+from pipeline.image.frames import read_samples
 from pipeline.image.noise import Noise
 from pipeline.image.radiometry import Exposed, Merged
-from pipeline.image.raw import read_mosaic
 from pipeline.run.artifacts import BRACKETS, EXPOSURES, FACTS, MOSAICS
 from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Frame, Raster, Result
@@ -47,7 +47,7 @@ def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.M
     still = {ball["name"] for ball in balls if ball.get("tripod")}
     own = {ball["name"]: json.dumps(ball["camera"], sort_keys=True) for ball in balls if ball.get("camera")}
     own |= {lens["name"]: "fisheye" for lens in facts.get("probe", {}).get("fisheye", [])}
-    return merge_brackets(brackets, lambda frame: read_mosaic(root / frame.file, frame), params, still, own)
+    return merge_brackets(brackets, lambda frame: read_samples(root / frame.file, frame), params, still, own)
 
 
 def merge_brackets(

@@ -50,16 +50,18 @@ BRIDGES = {
     },
     "pycolmap": {"pipeline/camera/colmap_bridge.py"},
     "rawpy": {"pipeline/image/raw.py"},
-    "tifffile": {"pipeline/image/raw.py"},
-    "imagecodecs": {"pipeline/simulation/dng.py"},
+    "tifffile": {"pipeline/image/encoded.py", "pipeline/image/raw.py"},
+    "imagecodecs": {"pipeline/image/encoded.py", "pipeline/simulation/dng.py"},
     "OpenEXR": {"pipeline/run/formats.py"},
     "PIL": {
+        "pipeline/image/encoded.py",
         "pipeline/run/formats.py",
         "pipeline/run/figures.py",
         "pipeline/image/jpeg.py",
         "pipeline/image/pictures.py",
         "pipeline/simulation/capture.py",
     },
+    "pi_heif": {"pipeline/image/encoded.py"},
     "PyOpenColorIO": {"pipeline/image/display.py"},
     "colour": {"pipeline/simulation/spectra.py"},  # spectra; its matrices are constants here, tested against it
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
@@ -73,6 +75,7 @@ SLOW = {*BRIDGES, "scipy"}  # to import; scipy has no place of its own
 LIGHT = {"numpy", "pydantic", "pipeline", "stages"}
 # Import name -> name in pyproject.toml, where they differ.
 DISTRIBUTIONS = {
+    "pi_heif": "pi-heif",
     "cv2": "opencv-contrib-python-headless", "drjit": "mitsuba", "PIL": "pillow", "PyOpenColorIO": "opencolorio",
     "colour": "colour-science", "colour_demosaicing": "colour-demosaicing", "flip_evaluator": "flip-evaluator",
     "mitsuba_oidn": "mitsuba-oidn",

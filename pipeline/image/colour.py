@@ -5,6 +5,7 @@ import; the tests hold these numbers against it). RGB is linear and scene-referr
 
 Sources: SMPTE RP 177 (primaries to matrix), Lam 1985 (Bradford), Adobe DNG 1.7.1 chapter 6 (camera colour), McCamy 1992
 (correlated colour temperature), IEC 61966-2-1 (sRGB curve), S-2014-004 (ACEScg).
+Limits: DNG's third calibration (ColorMatrix3) is not read: the first two are interpolated, as before DNG 1.6.
 """
 
 from __future__ import annotations
@@ -16,12 +17,22 @@ import numpy as np
 
 from pipeline.run.errors import CaptureError
 
-Space = Literal["acescg", "linear_rec709", "xyz"]
+Space = Literal["acescg", "linear_rec709", "linear_p3", "linear_rec2020", "linear_adobe_rgb", "linear_prophoto", "xyz"]
 
 # Chromaticities x, y of red, green, blue and white.
 ACESCG_CHROMATICITIES = np.array([[0.713, 0.293], [0.165, 0.830], [0.128, 0.044], [0.32168, 0.33767]])
 REC709_CHROMATICITIES = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]])
 D50_XY = np.array([0.34567, 0.35850])
+D65_XY = REC709_CHROMATICITIES[3]
+# Linear spaces that photographs come in, by name: the primaries and white of Display P3, Rec.2020, Adobe RGB (1998) and
+# ROMM RGB (ISO 22028-2).
+PRIMARIES = {
+    "linear_rec709": REC709_CHROMATICITIES,
+    "linear_p3": np.array([[0.680, 0.320], [0.265, 0.690], [0.150, 0.060], D65_XY]),
+    "linear_rec2020": np.array([[0.708, 0.292], [0.170, 0.797], [0.131, 0.046], D65_XY]),
+    "linear_adobe_rgb": np.array([[0.64, 0.33], [0.21, 0.71], [0.15, 0.06], D65_XY]),
+    "linear_prophoto": np.array([[0.734699, 0.265301], [0.159597, 0.840403], [0.036598, 0.000105], [0.3457, 0.3585]]),
+}
 
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -58,10 +69,10 @@ def _from_xyz(space: Space) -> np.ndarray:
         return np.eye(3)
     if space == "acescg":
         return np.linalg.inv(xyz_from_rgb(ACESCG_CHROMATICITIES))
-    if space == "linear_rec709":
-        to_d65 = adaptation(aces_white, xyz_of_xy(REC709_CHROMATICITIES[3]))
-        return np.linalg.solve(xyz_from_rgb(REC709_CHROMATICITIES), to_d65)
-    raise ValueError(f"unknown colour space {space!r}; expected acescg, linear_rec709 or xyz")
+    if space in PRIMARIES:
+        to_white = adaptation(aces_white, xyz_of_xy(PRIMARIES[space][3]))
+        return np.linalg.solve(xyz_from_rgb(PRIMARIES[space]), to_white)
+    raise ValueError(f"unknown colour space {space!r}; expected acescg, xyz, {', '.join(PRIMARIES)}")
 
 
 @cache
@@ -119,14 +130,25 @@ def temperature_of_xy(xy: np.ndarray) -> float:
     return float(-449.0 * n**3 + 3525.0 * n**2 - 6823.3 * n + 5520.33)
 
 
+def calibration_weight(kelvin: tuple[float, float], temperature: float) -> float:
+    """Share of the first of two calibrations: linear in 1/K between their illuminants, held outside (DNG chapter 6)."""
+    low, high = sorted(kelvin)
+    inverse = 1 / min(max(temperature, low), high)
+    return float((inverse - 1 / kelvin[1]) / (1 / kelvin[0] - 1 / kelvin[1]))
+
+
 def interpolated_matrix(
     color_matrix: np.ndarray, color_matrix_2: np.ndarray, kelvin: tuple[float, float], temperature: float
 ) -> np.ndarray:
-    """ColorMatrix (3, 3) between two calibration illuminants, linear in 1/K and held outside (DNG chapter 6)."""
-    low, high = sorted(kelvin)
-    inverse = 1 / min(max(temperature, low), high)
-    weight = (inverse - 1 / kelvin[1]) / (1 / kelvin[0] - 1 / kelvin[1])
+    """ColorMatrix (3, 3) between two calibration illuminants."""
+    weight = calibration_weight(kelvin, temperature)
     return weight * color_matrix + (1 - weight) * color_matrix_2
+
+
+def kelvin_of(illuminant: int, illuminant_2: int) -> tuple[float, float] | None:
+    """Temperatures of two calibration illuminants, EXIF codes; None where they cannot be interpolated between."""
+    kelvin = ILLUMINANT_K.get(illuminant, 0), ILLUMINANT_K.get(illuminant_2, 0)
+    return None if 0 in kelvin or kelvin[0] == kelvin[1] else kelvin
 
 
 def camera_white(
@@ -140,8 +162,8 @@ def camera_white(
 
     With two calibrations the white and the matrix depend on each other; iterated from D50 as DNG chapter 6 says.
     """
-    kelvin = ILLUMINANT_K.get(illuminant, 0), ILLUMINANT_K.get(illuminant_2, 0)
-    if color_matrix_2 is None or 0 in kelvin or kelvin[0] == kelvin[1]:
+    kelvin = kelvin_of(illuminant, illuminant_2)
+    if color_matrix_2 is None or kelvin is None:
         return color_matrix, np.linalg.solve(color_matrix, neutral)
     xy = D50_XY
     for _ in range(30):
@@ -161,9 +183,9 @@ def neutral_of_white(
     illuminant_2: int = 0,
 ) -> np.ndarray:
     """How a camera sees a white given as XYZ (3,): its neutral (3,), green 1. The inverse of `camera_white`."""
-    kelvin = ILLUMINANT_K.get(illuminant, 0), ILLUMINANT_K.get(illuminant_2, 0)
+    kelvin = kelvin_of(illuminant, illuminant_2)
     current = color_matrix
-    if color_matrix_2 is not None and 0 not in kelvin and kelvin[0] != kelvin[1]:
+    if color_matrix_2 is not None and kelvin is not None:
         temperature = temperature_of_xy(white[:2] / white.sum())
         current = interpolated_matrix(color_matrix, color_matrix_2, kelvin, temperature)
     neutral = current @ white
@@ -177,14 +199,21 @@ def acescg_from_camera(
     illuminant: int = 0,
     illuminant_2: int = 0,
     where: str = "camera colour",
+    forward_matrix: np.ndarray | None = None,
+    forward_matrix_2: np.ndarray | None = None,
 ) -> np.ndarray:
     """(3, 3) matrix from camera_rgb (black subtracted, *not* white balanced) to ACEScg, by the DNG colour matrices.
 
     A camera neutral scaled to green = 1 becomes (1, 1, 1): the scene's white is ACEScg white (Bradford). Without
-    ``as_shot_neutral`` the scene's white is taken as D65. Raises CaptureError without a usable ColorMatrix.
+    ``as_shot_neutral`` the scene's white is taken as D65. With ForwardMatrix tags the ColorMatrix gives only the
+    scene's white, and they the colours (XYZ D50 of white balanced camera_rgb, adapted to ACEScg white).
+    Raises CaptureError without a usable ColorMatrix.
     """
     if color_matrix is None or abs(np.linalg.det(color_matrix)) < 1e-6:
-        raise CaptureError(f"{where}: no usable ColorMatrix1 in the RAW, needed for ACEScg; convert the file to DNG")
+        raise CaptureError(
+            f"{where}: no usable ColorMatrix1 in the RAW, needed for ACEScg; convert the file to DNG, or photograph a "
+            'chart: [chart] fit = "matrix"'
+        )
     neutral = as_shot_neutral
     if neutral is None:
         neutral = color_matrix @ xyz_of_xy(REC709_CHROMATICITIES[3])
@@ -197,5 +226,16 @@ def acescg_from_camera(
         raise CaptureError(
             f"{where}: ColorMatrix1 maps the neutral to XYZ {white.round(4).tolist()}; no colour, fix it"
         )
-    to_aces = adaptation(white, xyz_of_xy(ACESCG_CHROMATICITIES[3])) / white[1]
-    return _from_xyz("acescg") @ to_aces @ np.linalg.inv(current)
+    aces_white = xyz_of_xy(ACESCG_CHROMATICITIES[3])
+    if forward_matrix is None:
+        return _from_xyz("acescg") @ adaptation(white, aces_white) / white[1] @ np.linalg.inv(current)
+    forward = forward_matrix
+    kelvin = kelvin_of(illuminant, illuminant_2)
+    if forward_matrix_2 is not None and kelvin is not None:
+        temperature = temperature_of_xy(white[:2] / white.sum())
+        forward = interpolated_matrix(forward_matrix, forward_matrix_2, kelvin, temperature)
+    d50 = xyz_of_xy(D50_XY)
+    sums = forward.sum(1)
+    if not np.allclose(sums, d50, atol=0.03):  # DNG: the neutral is D50 but for rounding
+        raise CaptureError(f"{where}: ForwardMatrix1 maps the neutral to XYZ {sums.round(4).tolist()}, not D50; fix it")
+    return _from_xyz("acescg") @ adaptation(d50, aces_white) @ ((d50 / sums)[:, None] * forward / neutral)
