@@ -92,6 +92,7 @@ class Frame(Record):
     focal_mm: float = 0.0
     focal_35mm: float = 0.0
     lens: str = ""
+    vignetting: Array | None = None  # (7,) of DNG's FixVignetteRadial: k0..k4 of its gain, centre x, y in [0, 1]
     encoding: Literal["linear", "display"] = "linear"  # display: through a response curve nobody states (JPEG, HEIC)
     space: str = ""  # linear space of data that are no camera_rgb: "linear_rec709", "acescg"; empty: camera_rgb
     nd_stops: float = 0.0  # of a neutral filter before the lens, as stated; exposure_s and fnumber do not hold it

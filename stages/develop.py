@@ -71,8 +71,8 @@ def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:
         profile = json.loads(mosaic.attributes["insitu:colour"])
     except (KeyError, TypeError, ValueError) as error:
         raise ArtifactError(f"{view}: mosaic carries no colour profile; run merge again") from error
-    for key in ("color_matrix", "color_matrix_2", "as_shot_neutral"):
-        profile[key] = None if profile[key] is None else np.array(profile[key], float)
+    for key in ("color_matrix", "color_matrix_2", "as_shot_neutral", "forward_matrix", "forward_matrix_2"):
+        profile[key] = None if profile.get(key) is None else np.array(profile[key], float)
     profile["space"] = mosaic.space
     return dict(profile)
 
@@ -114,6 +114,8 @@ def acescg_of(profile: dict[str, Any], where: str) -> np.ndarray:
         profile["illuminant"],
         profile["illuminant_2"],
         f"{where} ({profile['file']})",
+        profile["forward_matrix"],
+        profile["forward_matrix_2"],
     )
 
 

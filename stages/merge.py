@@ -309,11 +309,16 @@ def colour_profiles(brackets: dict[str, Bracket], warnings: list[str]) -> dict[s
             if text not in warnings:
                 warnings.append(text)
     keys = ("camera", "color_matrix", "color_matrix_2", "illuminant", "illuminant_2", "as_shot_neutral")
+    keys += ("forward_matrix", "forward_matrix_2")
+    optics = {"lens", "focal_mm", "focal_35mm", "fnumber", "vignetting"}
     dumped = {
         camera: {"file": frame.file, **{key: frame.model_dump(mode="json", include=set(keys))[key] for key in keys}}
         for camera, frame in first.items()
     }
-    return {view: dumped[bracket.frames[0].camera] for view, bracket in brackets.items()}
+    return {
+        view: {**dumped[one.frames[0].camera], "optics": one.frames[0].model_dump(mode="json", include=optics)}
+        for view, one in brackets.items()
+    }
 
 
 def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:
