@@ -78,7 +78,9 @@ class Frame(Record):
     height: int
     cfa: str  # colours of the 2x2 cell read in rows, "RGGB"; "" for data that are already (H, W, 3)
     black: Array  # (2, 2) in CFA cell order, (1, 3) of data without one; DN
-    white: float  # DN
+    white: float  # DN; 0: nobody says
+    linear_limit: float = 1.0  # share of white - black up to which the sensor is linear, as DNG LinearResponseLimit
+    bad_pixels: Indices | None = None  # (N, 2) row, column of photosites that file or manifest name as defective
     camera: str = ""
     timestamp: str = ""
     color_matrix: Array | None = None  # (3, 3) ColorMatrix1, camera_rgb from XYZ
@@ -139,6 +141,24 @@ class View(Record):
     alternative: Array | None = None  # (4, 4) the second planar solution, refined
     lens_covariance: Array | None = None  # (6, 9) of the pose with Camera's nine numbers; None when given
     camera: Camera | None = None  # its own body, lens or size; None: the plate's
+
+
+class Reconstruction(Record):
+    """Poses, lenses and a cloud of points from photographs alone (structure from motion), in a frame of its own.
+
+    Empty when nothing asked for it. The frame has no unit and no up.
+    """
+
+    method: str = ""  # "incremental" or "global"
+    names: list[str] = []  # photographs that were oriented: views by name, others by file
+    missing: list[str] = []  # those that were not
+    world_from_camera: Array = np.zeros((0, 4, 4))  # (N, 4, 4)
+    cameras: list[Camera] = []
+    camera_of: Indices = np.zeros(0, int)  # (N,)
+    points: Array = np.zeros((0, 3))  # (M, 3)
+    seen_view: Indices = np.zeros(0, int)  # (K,) which photograph
+    seen_point: Indices = np.zeros(0, int)  # (K,) shows which point
+    px: Array = np.zeros((0, 2))  # (K, 2) where
 
 
 class BallFit(Record):

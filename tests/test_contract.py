@@ -49,9 +49,9 @@ BRIDGES = {
         "pipeline/simulation/twin_world.py",
     },
     "pycolmap": {"pipeline/camera/colmap_bridge.py"},
-    "rawpy": {"pipeline/image/raw.py"},
-    "tifffile": {"pipeline/image/encoded.py", "pipeline/image/raw.py"},
-    "imagecodecs": {"pipeline/image/encoded.py", "pipeline/simulation/dng.py"},
+    "rawpy": {"pipeline/image/libraw.py"},
+    "tifffile": {"pipeline/image/encoded.py", "pipeline/image/tags.py"},
+    "imagecodecs": {"pipeline/image/dng_data.py", "pipeline/image/encoded.py", "pipeline/simulation/dng.py"},
     "OpenEXR": {"pipeline/run/formats.py"},
     "PIL": {
         "pipeline/image/encoded.py",

@@ -1,27 +1,53 @@
-"""RAW files: what their metadata say, and the mosaic as the sensor gave it. The only importer of rawpy and tifffile.
+"""RAW files: what their metadata say, and the samples as the sensor gave them.
 
-Metadata of a DNG come from its tags (LibRaw exposes neither ColorMatrix1 nor NoiseProfile of a DNG), with the CFA
-pattern and BlackLevel relative to ActiveArea as DNG 1.7.1 defines them: LibRaw labels odd active areas wrongly, so the
-crop is made here. Other RAW files take geometry, black and white from LibRaw. Exposure comes from EXIF alone: LibRaw
-reports 1 s and f/1 when there is none. Nothing is scaled, white balanced or clipped.
-
-Limits: Bayer mosaics of integers; X-Trans, linear and float DNG are refused. BlackLevelDeltaH/V enter as their mean.
+A DNG is read from its tags and decoded here (`dng`, `dng_data`): Bayer mosaics, linear DNG of three channels, integers
+and floating point; X-Trans goes through LibRaw's demosaic. Other RAW files take geometry, black and white from LibRaw
+(`libraw`). Exposure comes from EXIF alone. Nothing is scaled, white balanced or clipped; what nobody states is 0 or
+None, and `pipeline.image.sensor` asks for it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.image import dng, libraw, optical_black
+from pipeline.image.computational import by_metadata
+from pipeline.image.dng_data import Layout, layout_of, read_samples
+from pipeline.image.optical_black import OpticalBlack
+from pipeline.image.tags import Tags, camera_name, exif_exposure, is_tiff, main_tags, opened, tags_of
 from pipeline.run.errors import CaptureError
 from pipeline.types import Frame
 
-BAYER = ("RGGB", "GRBG", "GBRG", "BGGR")
-CFA_PHOTOMETRIC, LINEAR_RAW_PHOTOMETRIC = 32803, 34892
-RATIONAL, SRATIONAL = 5, 10  # TIFF types that tifffile returns as flat numerator, denominator pairs
+# What readers of damaged files raise besides their own errors.
+DAMAGE = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, ArithmeticError, RuntimeError, MemoryError,
+    struct.error, AssertionError, NotImplementedError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """The samples of one frame with what the same decode tells about its sensor."""
+
+    samples: np.ndarray  # (H, W) or (H, W, 3) DN of the active area, black not subtracted
+    black: OpticalBlack | None  # measured on masked photosites of a Bayer mosaic, where there are any
+    defects: np.ndarray  # (N, 2) row, column that the file marks as defective
+
+
+@dataclass(frozen=True, eq=False)
+class _Dng:
+    """A DNG's raw directory."""
+
+    kind: str  # "bayer", "linear", "xtrans"
+    tags: Tags
+    layout: Layout
+    area: dng.Box
 
 
 def file_sha256(path: Path) -> str:
@@ -33,278 +59,164 @@ def file_sha256(path: Path) -> str:
 def read_metadata(path: Path, name: str = "") -> Frame:
     """What a RAW file says about itself; ``name`` (default: the file's) is stored in ``Frame.file``.
 
-    Exposure time, ISO or f-number that EXIF lacks come back as 0. Raises CaptureError, one line, when the file is no
-    RAW, is shorter than it declares, or is of an unsupported kind.
+    Exposure time, ISO or f-number that EXIF lacks, and a white level that nothing says, come back as 0; a missing
+    colour matrix as None. Raises CaptureError, one line, when the file is no RAW, is shorter than it declares, or is of
+    an unsupported kind.
     """
-    import logging
-
-    import tifffile
-
     name = name or path.name
     if not path.is_file():
         raise CaptureError(f"{name}: no such file")
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # it logs what is raised here as errors
+    facts: dict[str, Any] = {"exposure_s": 0.0, "iso": 0.0, "fnumber": 0.0}
     try:
-        with tifffile.TiffFile(path) as tiff:
-            pages = _all_pages(tiff)
-            tags = _main_tags(pages)
-            sensor = _dng_sensor(name, pages, path.stat().st_size) if 50706 in tags else _libraw_sensor(name, path)
-            facts = {**_dng_colour(tags), **sensor, **_exif_exposure(tags), "camera": _camera_name(tags)}
-    except tifffile.TiffFileError:
-        facts = _libraw_sensor(name, path)
-    except (ValueError, KeyError, IndexError, TypeError, OSError, ZeroDivisionError) as error:
-        raise CaptureError(f"{name}: damaged RAW metadata ({error}); copy the file again from the card") from error
-    return Frame(**{"exposure_s": 0.0, "iso": 0.0, "fnumber": 0.0, **facts}, file=name, sha256=file_sha256(path))
+        if not is_tiff(path):
+            facts |= libraw.sensor_of(name, path)
+        else:
+            with opened(path) as (_, pages):
+                main = main_tags(pages)
+                own = _dng_facts(name, path, pages) if dng.DNG_VERSION in main else _other_facts(name, path, pages)
+                facts |= {**own, **exif_exposure(main), "camera": camera_name(main)}
+        return Frame(**facts, file=name, sha256=file_sha256(path))
+    except DAMAGE as error:
+        raise _damaged(name, error) from error
+    except Exception as error:  # tifffile's own error derives from Exception alone
+        if type(error).__module__.split(".")[0] != "tifffile":
+            raise
+        raise _damaged(name, error) from error
 
 
-def read_mosaic(path: Path, frame: Frame) -> np.ndarray:
-    """Active area of the mosaic as stored, (H, W) uint16 DN, black not subtracted.
+def _damaged(name: str, error: Exception) -> CaptureError:
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    return CaptureError(f"{name}: damaged RAW metadata ({reason}); copy the file again from the card")
+
+
+def _dng_of(name: str, path: Path, pages: list[Any]) -> _Dng:
+    page = dng.raw_page(name, pages)
+    tags = tags_of(page)
+    layout = layout_of(name, page, pages, path.stat().st_size)
+    return _Dng(dng.mosaic_of(name, tags), tags, layout, dng.active_area(tags))
+
+
+def _dng_facts(name: str, path: Path, pages: list[Any]) -> dict[str, Any]:
+    """Everything a DNG says besides its exposure."""
+    file, main = _dng_of(name, path, pages), main_tags(pages)
+    colour, marks = dng.colour_of(main)
+    tags = file.tags
+    marks += dng.oddities(name, main, tags)
+    marks += by_metadata(
+        dng.phone_maker(main), file.kind == "linear", dng.semantic_masks(pages), 52525 in main, 50940 in main
+    )
+    marks += [libraw.XTRANS_MARK] * (file.kind == "xtrans")
+    defects = dng.listed_defects(tags)
+    return {
+        **colour,
+        **dng.sensor_of(name, main, tags),
+        "lens": dng.lens_of(main),
+        "vignetting": dng.vignetting_of(tags),
+        "bad_pixels": defects if len(defects) else None,
+        "marks": marks,
+    }
+
+
+def _other_facts(name: str, path: Path, pages: list[Any]) -> dict[str, Any]:
+    """Facts of a TIFF based RAW that is no DNG, its declared bytes counted."""
+    size = path.stat().st_size
+    for page in pages:
+        tags = tags_of(page)
+        for code, count in ((273, 279), (324, 325)):
+            if code in tags and count in tags:
+                end = int(np.max(np.ravel(tags[code].value)) + np.ravel(tags[count].value)[-1])
+                if end > size:
+                    raise CaptureError(f"{name}: {size} bytes, its image data end at {end}; copy the file again")
+    return libraw.sensor_of(name, path)
+
+
+def read_sensor(path: Path, frame: Frame) -> Sensor:
+    """Samples of the active area as stored, with measured black and marked defects, from one decode.
 
     Raises CaptureError when the file cannot be decoded, has another size than ``frame`` says, or is constant below
     white (LibRaw decodes some damaged files to zeros without an error).
     """
-    import rawpy
+    file = _dng_or_none(path, frame)
+    if file is None and frame.cfa:
+        stored, area = libraw.stored_mosaic(frame.file, path)
+        found = _black(stored, optical_black.margins(stored.shape, area), area, frame, "margins")
+        return Sensor(_checked(_crop(stored, area), frame), found, np.zeros((0, 2), int))
+    if file is None or file.kind == "xtrans":
+        samples = libraw.developed(frame.file, path, None if file is None else file.area)
+        return Sensor(_checked(samples, frame), None, np.zeros((0, 2), int))
+    stored = read_samples(frame.file, path, file.layout)
+    found = None
+    if file.kind == "bayer":
+        masked = dng.masked_areas(file.tags)
+        source = "MaskedAreas" if masked else "margins"
+        found = _black(stored, masked or optical_black.margins(stored.shape, file.area), file.area, frame, source)
+    samples = _checked(_crop(stored, file.area), frame)
+    value = dng.defect_value(file.tags)
+    defects = np.zeros((0, 2), int) if value is None else np.argwhere(samples == value)
+    return Sensor(_flattened(samples, file.tags, frame.white), found, defects)
 
+
+def read_mosaic(path: Path, frame: Frame) -> np.ndarray:
+    """Active area as stored: (H, W) uint16 DN of a mosaic, (H, W, 3) of a frame with an empty ``cfa``.
+
+    float32 for floating-point files and where black differs along rows or columns. Raises as `read_sensor`.
+    """
+    return read_sensor(path, frame).samples
+
+
+def read_rows(path: Path, frame: Frame, start: int, stop: int) -> np.ndarray:
+    """Rows [start, stop) of `read_mosaic`; of a DNG in strips or tiles only those that hold them are decoded."""
+    file = _dng_or_none(path, frame)
+    if file is None or file.kind == "xtrans" or dng.black_ripple(file.tags) is not None:
+        return read_mosaic(path, frame)[start:stop]
+    top, left, bottom, right = file.area
+    if (bottom - top, right - left) != (frame.height, frame.width):
+        raise _other_size(frame, (bottom - top, right - left))
+    return read_samples(frame.file, path, file.layout, (top + start, top + stop))[:, left:right]
+
+
+def _dng_or_none(path: Path, frame: Frame) -> _Dng | None:
+    """The DNG's directory; None for other files. Raises CaptureError when it is gone or damaged."""
     if not path.is_file():
         raise CaptureError(f"{frame.file}: no such file; restore it or run ingest again")
-    try:
-        with rawpy.imread(str(path)) as raw:
-            visible = raw.raw_image_visible
-            box = _active_area(path) if raw.raw_image.shape != visible.shape else None
-            area = visible if box is None else raw.raw_image[box[0] : box[2], box[1] : box[3]]
-            mosaic = np.array(area)
-    except rawpy.LibRawError as error:
-        raise CaptureError(f"{frame.file}: cannot be decoded ({_libraw_text(error)}); copy it again") from error
-    if mosaic.shape != (frame.height, frame.width):
-        found = f"{mosaic.shape[1]} x {mosaic.shape[0]}"
-        raise CaptureError(f"{frame.file}: decodes to {found}, metadata say {frame.width} x {frame.height}; copy again")
-    if mosaic.min() == mosaic.max() < frame.white:  # all at white is a clipped frame, which merge can tell
-        raise CaptureError(f"{frame.file}: every pixel is {mosaic.flat[0]}, so its RAW data are missing; copy it again")
-    return mosaic
-
-
-def _all_pages(tiff: Any) -> list[Any]:
-    """Every IFD of a TIFF, SubIFDs included."""
-    found, queue = [], list(tiff.pages)
-    while queue:
-        page = queue.pop(0)
-        found.append(page)
-        queue.extend(page.pages or [])
-    return found
-
-
-def _main_tags(pages: list[Any]) -> dict[int, Any]:
-    """Tag code -> tag of the first IFD, completed by the others'."""
-    tags: dict[int, Any] = {}
-    for page in pages:
-        for tag in page.tags.values():
-            tags.setdefault(tag.code, tag)
-    return tags
-
-
-def _numbers(tags: dict[int, Any], code: int) -> np.ndarray | None:
-    """Values of a numeric tag as float64, rationals divided; None when absent."""
-    tag = tags.get(code)
-    if tag is None:
+    if not is_tiff(path):
         return None
-    value = np.asarray(list(tag.value) if isinstance(tag.value, (bytes, tuple, list)) else [tag.value], float)
-    if tag.dtype in (RATIONAL, SRATIONAL):
-        if np.any(value[1::2] == 0):
-            raise ValueError(f"{tag.name} has a zero denominator")
-        value = value[0::2] / value[1::2]
-    return value
-
-
-def _ratio(value: Any) -> float:
-    """A number or an EXIF rational; 0 when it says nothing."""
-    if isinstance(value, (tuple, list)):
-        return float(value[0]) / float(value[1]) if len(value) == 2 and value[1] else 0.0
-    return float(value) if isinstance(value, (int, float)) else 0.0
-
-
-def _exif_exposure(tags: dict[int, Any]) -> dict[str, Any]:
-    """Exposure facts of the EXIF IFD, or of IFD 0 where TIFF/EP writers put them, as far as they say something."""
-    exif = tags[34665].value if 34665 in tags else {}
-    exif = exif if isinstance(exif, dict) else {}
-
-    def get(key: str, code: int) -> Any:
-        return exif.get(key, tags[code].value if code in tags else 0)
-
-    iso = get("ISOSpeedRatings", 34855)
-    iso = iso[0] if isinstance(iso, (tuple, list)) and iso else iso
-    date = exif.get("DateTimeOriginal") or (tags[306].value if 306 in tags else "")
-    facts = {
-        "exposure_s": _ratio(get("ExposureTime", 33434)),
-        "fnumber": _ratio(get("FNumber", 33437)),
-        "iso": _ratio(iso),
-        "focal_mm": _ratio(get("FocalLength", 37386)),
-        "timestamp": date if isinstance(date, str) else "",
-    }
-    return {key: value for key, value in facts.items() if value}
-
-
-def _camera_name(tags: dict[int, Any]) -> str:
-    if 50708 in tags and isinstance(tags[50708].value, str):
-        return str(tags[50708].value)
-    return " ".join(str(tags[code].value).strip() for code in (271, 272) if code in tags)
-
-
-def _dng_sensor(name: str, pages: list[Any], file_size: int) -> dict[str, Any]:
-    """Size, CFA, black and white of a DNG's full-size mosaic."""
-    page = _mosaic_page(name, pages)
-    tags = {tag.code: tag for tag in page.tags.values()}
-    _refuse_truncated(name, tags, file_size)
-    _refuse_float(name, tags)
-    top, left, bottom, right = _area_of(tags)
-    repeat = _numbers(tags, 33421)
-    pattern = bytes(tags[33422].value)
-    if repeat is None or tuple(repeat) != (2, 2) or (cfa := "".join("RGB?"[min(c, 3)] for c in pattern)) not in BAYER:
-        raise CaptureError(f"{name}: colour filter {pattern.hex()} is no 2x2 Bayer pattern; only Bayer RAW is read")
-    bits = int(np.ravel(tags[258].value)[0])
-    white = _numbers(tags, 50717)
-    return {
-        "width": right - left,
-        "height": bottom - top,
-        "cfa": cfa,
-        "black": _dng_black(name, tags),
-        "white": float(2**bits - 1 if white is None else white[0]),
-    }
-
-
-def _mosaic_page(name: str, pages: list[Any]) -> Any:
-    """The largest CFA image of a DNG."""
-    kinds = {int(page.tags[262].value) for page in pages if 262 in page.tags}
-    mosaics = [page for page in pages if 262 in page.tags and int(page.tags[262].value) == CFA_PHOTOMETRIC]
-    if not mosaics:
-        kind = "a linear (demosaicked) DNG" if LINEAR_RAW_PHOTOMETRIC in kinds else "no mosaic"
-        raise CaptureError(f"{name}: holds {kind}, needed Bayer RAW; give the camera's own file or a mosaic DNG")
-    return max(mosaics, key=lambda page: int(page.tags[256].value) * int(page.tags[257].value))
-
-
-def _refuse_truncated(name: str, tags: dict[int, Any], file_size: int) -> None:
-    """LibRaw decodes a DNG with missing tiles to zeros without an error, so the declared bytes are counted here."""
-    width, height = int(tags[256].value), int(tags[257].value)
-    tiled = 324 in tags
-    offsets, counts = _numbers(tags, 324 if tiled else 273), _numbers(tags, 325 if tiled else 279)
-    if offsets is None or counts is None:
-        raise CaptureError(f"{name}: declares no image data; copy the file again")
-    if tiled:
-        across, down = int(tags[322].value), int(tags[323].value)
-        expected = -(-width // across) * -(-height // down)
-    else:
-        expected = -(-height // int(tags[278].value)) if 278 in tags else 1
-    if len(offsets) < expected or len(counts) < expected:
-        raise CaptureError(f"{name}: {len(offsets)} of {expected} pieces of the picture are there; copy the file again")
-    if (end := int((offsets + counts).max())) > file_size:
-        raise CaptureError(f"{name}: {file_size} bytes, its image data end at {end}; copy the file again")
-
-
-def _refuse_float(name: str, tags: dict[int, Any]) -> None:
-    if 339 in tags and int(np.ravel(tags[339].value)[0]) != 1:
-        raise CaptureError(f"{name}: a floating-point DNG, needed integers; give the camera's own file")
-
-
-def _area_of(tags: dict[int, Any]) -> tuple[int, int, int, int]:
-    """ActiveArea (top, left, bottom, right) of a raw IFD, by default all of it."""
-    area = _numbers(tags, 50829)
-    if area is None:
-        return 0, 0, int(tags[257].value), int(tags[256].value)
-    top, left, bottom, right = (int(value) for value in area)
-    if not (0 <= top < bottom <= int(tags[257].value) and 0 <= left < right <= int(tags[256].value)):
-        raise ValueError(f"ActiveArea {area.tolist()} lies outside the picture")
-    return top, left, bottom, right
-
-
-def _dng_black(name: str, tags: dict[int, Any]) -> np.ndarray:
-    """BlackLevel (2, 2) DN in CFA cell order, origin at the active area's corner."""
-    level = _numbers(tags, 50714)
-    repeat = _numbers(tags, 50713)
-    rows, columns = (1, 1) if repeat is None else (int(repeat[0]), int(repeat[1]))
-    if rows > 2 or columns > 2:
-        raise CaptureError(f"{name}: BlackLevel repeats over {rows} x {columns}, needed at most 2 x 2; convert it")
-    black = np.zeros((2, 2)) if level is None else np.broadcast_to(level.reshape(rows, columns), (2, 2))
-    deltas = [_numbers(tags, code) for code in (50715, 50716)]
-    return black + sum(float(delta.mean()) for delta in deltas if delta is not None)
-
-
-def _dng_colour(tags: dict[int, Any]) -> dict[str, Any]:
-    """Colour and noise tags of a DNG; AnalogBalance and CameraCalibration are folded into the matrices."""
-    if 50706 not in tags:
-        return {}
-    balance = _numbers(tags, 50727)
-
-    def calibrated(matrix_code: int, calibration_code: int) -> np.ndarray | None:
-        matrix, calibration = _numbers(tags, matrix_code), _numbers(tags, calibration_code)
-        if matrix is None or matrix.size != 9:
-            return None
-        result = matrix.reshape(3, 3)
-        if calibration is not None and calibration.size == 9:
-            result = calibration.reshape(3, 3) @ result
-        return result if balance is None or balance.size != 3 else balance[:, None] * result
-
-    neutral, noise = _numbers(tags, 50728), _numbers(tags, 51041)
-    return {
-        "color_matrix": calibrated(50721, 50723),
-        "color_matrix_2": calibrated(50722, 50724),
-        "illuminant": int(tags[50778].value) if 50778 in tags else 0,
-        "illuminant_2": int(tags[50779].value) if 50779 in tags else 0,
-        "as_shot_neutral": neutral if neutral is not None and neutral.size == 3 else None,
-        "noise_profile": noise if noise is not None and noise.size in (2, 6) else None,
-    }
-
-
-def _libraw_sensor(name: str, path: Path) -> dict[str, Any]:
-    """Size, CFA, black, white and colour of a RAW that is no DNG, as LibRaw knows its camera."""
-    import rawpy
-
     try:
-        with rawpy.imread(str(path)) as raw:
-            pattern = raw.raw_pattern
-            if raw.raw_type != rawpy.RawType.Flat or pattern is None or pattern.shape != (2, 2):
-                raise CaptureError(f"{name}: its sensor is no 2x2 Bayer mosaic; only Bayer RAW is read")
-            letters = raw.color_desc.decode()
-            cfa = "".join(letters[number] for number in pattern.ravel())
-            if cfa not in BAYER:
-                raise CaptureError(f"{name}: colour filter {cfa} is no Bayer pattern; only Bayer RAW is read")
-            black = np.asarray(raw.black_level_per_channel, float)[pattern]
-            linear = [value for value in (raw.camera_white_level_per_channel or []) if value > 0]
-            matrix = np.asarray(raw.rgb_xyz_matrix, float)[:3]
-            balance = np.asarray(raw.camera_whitebalance, float)[:3]
-            return {
-                "width": raw.sizes.width, "height": raw.sizes.height, "cfa": cfa, "black": black,
-                "white": float(min([raw.white_level, *linear])),
-                "color_matrix": matrix if np.any(matrix) else None, "illuminant": 21,  # LibRaw keeps the D65 matrix
-                "as_shot_neutral": 1 / balance if np.all(balance > 0) and np.ptp(balance) > 0 else None,
-                **_libraw_exposure(raw.other),
-            }  # fmt: skip
-    except rawpy.LibRawError as error:
-        raise CaptureError(f"{name}: not a readable RAW file ({_libraw_text(error)}); give the camera's RAW") from error
+        with opened(path) as (_, pages):
+            return _dng_of(frame.file, path, pages) if dng.DNG_VERSION in main_tags(pages) else None
+    except DAMAGE as error:
+        raise _damaged(frame.file, error) from error
 
 
-def _libraw_exposure(other: Any) -> dict[str, float]:
-    """LibRaw's exposure of a file whose EXIF is elsewhere; 1 s at f/1 is what it says when it found none."""
-    invented = other.shutter_speed == 1.0 and other.aperture in (0.0, 1.0)
-    found = {"iso": other.iso_speed, "focal_mm": other.focal_length}
-    if not invented:
-        found |= {"exposure_s": other.shutter_speed, "fnumber": other.aperture}
-    return {key: float(value) for key, value in found.items()}
+def _crop(stored: np.ndarray, area: dng.Box) -> np.ndarray:
+    top, left, bottom, right = area
+    return np.ascontiguousarray(stored[top:bottom, left:right])
 
 
-def _libraw_text(error: Exception) -> str:
-    text = error.args[0] if error.args else type(error).__name__
-    return text.decode() if isinstance(text, bytes) else str(text)
+def _checked(samples: np.ndarray, frame: Frame) -> np.ndarray:
+    """The samples, if they are what the frame says and are no blank."""
+    if samples.shape[:2] != (frame.height, frame.width):
+        raise _other_size(frame, samples.shape)
+    low, high = samples.min(), samples.max()
+    if low == high and (high < frame.white or high == 0):  # all at white is a clipped frame, which merge can tell
+        raise CaptureError(f"{frame.file}: every pixel is {low:g}, so its RAW data are missing; copy it again")
+    return samples
 
 
-def _active_area(path: Path) -> tuple[int, int, int, int] | None:
-    """ActiveArea of a DNG as its tags say; None for other files, whose margins LibRaw knows."""
-    import tifffile
+def _other_size(frame: Frame, shape: tuple[int, ...]) -> CaptureError:
+    found = f"{shape[1]} x {shape[0]}"
+    return CaptureError(f"{frame.file}: decodes to {found}, metadata say {frame.width} x {frame.height}; copy again")
 
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            pages = _all_pages(tiff)
-            if 50706 not in _main_tags(pages):
-                return None
-            page = _mosaic_page(path.name, pages)
-            return _area_of({tag.code: tag for tag in page.tags.values()})
-    except tifffile.TiffFileError:
-        return None
+
+def _flattened(samples: np.ndarray, tags: Tags, white: float) -> np.ndarray:
+    """Samples less the part of black that differs along rows and columns; those at white stay there."""
+    ripple = dng.black_ripple(tags)
+    if ripple is None:
+        return samples
+    ripple = ripple if samples.ndim == 2 else ripple[..., None]
+    return np.where(samples >= white, samples.astype(np.float32), samples - ripple)
+
+
+def _black(stored: np.ndarray, areas: list[dng.Box], area: dng.Box, frame: Frame, source: str) -> OpticalBlack | None:
+    scale = frame.white - float(np.mean(frame.black))
+    return optical_black.measure(stored, areas, area, scale, frame.black, source) if areas and scale > 0 else None
