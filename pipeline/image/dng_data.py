@@ -28,6 +28,7 @@ NONE, JPEG, DEFLATE, LOSSY_JPEG, JPEG_XL = 1, 7, 8, 34892, 52546
 COMPRESSIONS = (NONE, JPEG, DEFLATE, LOSSY_JPEG, JPEG_XL)
 STRIDES = {1: 0, 2: 1, 34892: 2, 34893: 4, 3: 1, 34894: 2, 34895: 4}  # predictor -> pixels between the differences
 FLOAT_PREDICTORS = (3, 34894, 34895)
+JPEG_END = b"\xff\xd9"
 MAX_PIXELS = 2**30  # four times the largest sensor made; more is a damaged size
 
 
@@ -297,6 +298,8 @@ def _image(data: bytes, layout: Layout) -> np.ndarray:
     """A piece that is a coded image, as its own header says its shape."""
     import imagecodecs
 
+    if layout.compression != JPEG_XL and JPEG_END not in data[-64:]:
+        raise ValueError("no end marker")  # decoders fill up what is missing
     if layout.compression == JPEG_XL:
         image = imagecodecs.jpegxl_decode(data, numthreads=1)
     elif layout.compression == JPEG and b"\xff\xc3" in data[:1024]:

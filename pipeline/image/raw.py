@@ -93,6 +93,8 @@ def _dng_of(name: str, path: Path, pages: list[Any]) -> _Dng:
     page = dng.raw_page(name, pages)
     tags = tags_of(page)
     layout = layout_of(name, page, pages, path.stat().st_size)
+    for tag in tags.values():
+        _ = tag.value  # long values are read when first asked for, and the file is closed by then
     return _Dng(dng.mosaic_of(name, tags), tags, layout, dng.active_area(tags))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.image.libraw import XTRANS_MARK
 from pipeline.run.errors import CaptureError
 from pipeline.types import Frame
 
@@ -63,6 +64,8 @@ def missing(frame: Frame) -> list[str]:
             f"{frame.file}: {said} above black {np.max(frame.black):g}, needed where the sensor clips; state white "
             "(and black) in [[sensor]]"
         )
+    if XTRANS_MARK in frame.marks and not np.any(frame.black):  # LibRaw keeps black of some of them elsewhere
+        lines.append(f"{frame.file}: black is 0, which no X-Trans sensor has; state black in [[sensor]]")
     if frame.encoding == "linear" and not frame.space and _no_matrix(frame):
         lines.append(
             f"{frame.file}: no colour matrix in the file, needed camera_rgb from XYZ; state color_matrix in [[sensor]] "
