@@ -4,33 +4,39 @@ Per photosite and frame i: signal ``x_i = (DN - black) / (white - black)``, expo
 ``var(x_i) = shot_i g_i y + floor_i``. The estimate is ``y = sum(w_i x_i / g_i) / sum(w_i)`` over unclipped frames:
 
 - *poisson*: ``w_i = g_i / shot_i``, which is sum of counts over sum of times; needs no iteration and no signal.
-- *optimal*: ``w_i = g_i^2 / (shot_i g_i y' + floor_i)`` with y' the Poisson estimate averaged over the eight nearest
-  photosites of the same colour, *without* the photosite itself: a weight that depends on the sample's own noise
-  biases deep shadows (-0.6 % at 5 electrons).
+- *optimal*: ``w_i = g_i^2 / (shot_i g_i y' + floor_i)`` with y' the Poisson estimate averaged over the four nearest
+  photosites of the same colour in the row, *without* the photosite itself: a weight that depends on the sample's own
+  noise biases deep shadows (-0.6 % at 5 electrons). Where all of a stretch of a row has fifty times more shot than
+  read noise the Poisson weights are used: they lose less than 0.1 % there.
 
-Clipping is decided the same way. A sample within five sigma of the limit is used when its eight neighbours' mean lies
-two sigma below the limit, so that its own noise does not decide: cutting at a fixed level loses 0.4 sigma there.
+A sample at or above its limit says that the radiance is at least the limit. It enters *as the limit* when the shorter
+frames together lie below it by no more than four sigma, else not at all. To leave all clipped samples out would lose
+0.4 sigma, by choosing on the samples' own noise; so the bias stays below 0.1 sigma for frames up to two stops apart and
+0.3 at three, within two sigma of the limit and nowhere else, and neighbours have no say in it: texture does no harm.
 Negative values are kept. Sources: Hasinoff, Durand, Freeman 2010; Aguerrebere et al. 2014 (estimators and bounds).
 
+Data without a mosaic, (H, W, 3), go the same way, each channel for itself.
 Limits: the frames are taken as aligned; the noise of one photosite is taken as independent of the others'.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from pipeline.conventions import CLIPPED, DARK, GHOST, HOT
+from pipeline.conventions import HOT
+from pipeline.image import merge_kernel
+from pipeline.image.merge_kernel import MARGIN
 from pipeline.image.noise import Noise
 
-TILE_ROWS = 64  # even, so that a tile starts on a whole CFA cell; small enough to stay in cache
-HALO = 4  # rows of context: two of the neighbourhood, two more for the neighbours' own clipping decision
+TILE_ROWS = 16  # even, so that a tile starts on a whole CFA cell; few enough to stay in cache
 LIMIT_MARGIN = 0.002  # of full scale kept from the clip level: knee of the converter
 GHOST_SIGMA = 5.0  # of the chi-square, as a normal deviate: one false alarm in 3.5 million photosites
-RATIO_ERROR = 0.005  # relative disagreement of frames that exposure error and flicker explain
+LEAST_SHOT, LEAST_FLOOR = 1e-9, 1e-14  # of full scale: no data are better, and weights stay finite
 HOT_SIGMA = 8.0
 MAX_SUSPECTS = 0.005  # of the photosites are looked at as defects, the worst first; sensors have a tenth of it
 ISOLATION = 0.15  # a defect's neighbours of other colours show less than this of it; optics spread light wider
@@ -40,9 +46,12 @@ ADJACENT = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0
 
 @dataclass(frozen=True, eq=False)
 class Exposed:
-    """One frame of a view, ready to merge. The (2, 2) arrays are in CFA cell order."""
+    """One frame of a view, ready to merge.
 
-    mosaic: np.ndarray  # (H, W) DN
+    A mosaic is (H, W), its (2, 2) arrays in CFA cell order; data without one are (H, W, 3), their arrays (1, 3).
+    """
+
+    mosaic: np.ndarray  # (H, W) or (H, W, 3) DN; see `merge` for what else it may be
     exposure: float  # t * ISO / (100 * N^2)
     black: np.ndarray  # (2, 2) DN
     white: float  # DN
@@ -50,15 +59,17 @@ class Exposed:
     noise: Noise
 
     def signal(self, rows: slice = slice(None)) -> np.ndarray:
-        """(h, W) float32 normalised signal of rows that start on an even row."""
+        """(h, W) or (h, W, 3) float32 normalised signal of rows that start on an even row."""
         part = self.mosaic[rows]
         scale = 1 / (self.white - self.black)
+        if part.ndim == 3:
+            return ((part - self.black.astype(np.float32)) * scale.astype(np.float32)).astype(np.float32, copy=False)
         return (part - tiled(self.black, part.shape)) * tiled(scale, part.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Radiance (H, W) float32, its variance, its mask (uint32 bits of conventions), counts by name."""
+    """Radiance float32 of the frames' shape, its variance, its mask (uint32 bits of conventions)."""
 
     radiance: np.ndarray
     variance: np.ndarray
@@ -102,144 +113,84 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
 
     Bit CLIPPED: clipped in every frame, the value is the bound of the shortest, variance infinite. DARK: below one
     standard deviation. GHOST: chi-square of the frames beyond the noise, variance raised to what they show.
+
+    A frame's ``mosaic`` is asked for `TILE_ROWS` rows at a time and for each row once (twice when two exposures are
+    equal): it may be a memory-mapped file, or anything else with ``shape``, ``dtype`` and slices of rows.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    ordered = sorted(frames, key=lambda f: (f.exposure, f.mosaic.tobytes() if _tied(f, frames) else b""))
-    height, width = ordered[0].mosaic.shape
-    result = Merged(*(np.empty((height, width), dtype) for dtype in (np.float32, np.float32, np.uint32)))
+    tied = len({frame.exposure for frame in frames}) < len(frames)
+    ordered = sorted(frames, key=lambda frame: (frame.exposure, _digest(frame.mosaic) if tied else b""))
+    shape = ordered[0].mosaic.shape
+    result = Merged(*(np.empty(shape, dtype) for dtype in (np.float32, np.float32, np.uint32)))
+    pitch = 2 if len(shape) == 2 else shape[2]
+    coefficients = np.stack([[_coefficients(frame, phase) for frame in ordered] for phase in range(2)])
+    limits = _chi2_limits(len(ordered))
+    dtype = np.uint16 if all(frame.mosaic.dtype in (np.uint8, np.uint16) for frame in ordered) else np.float32
+    kernel, tiles = merge_kernel.block_kernel(), range(0, shape[0], TILE_ROWS)
 
-    def work(tile: tuple[slice, slice, slice]) -> None:
-        outer, inner, target = tile
-        part = _merge_rows(ordered, outer, weights)
-        for whole, piece in zip((result.radiance, result.variance, result.mask), part):
-            whole[target] = piece[inner]
+    def work(share: range) -> None:
+        samples = merge_kernel.padded_rows(len(ordered), TILE_ROWS, int(np.prod(shape[1:])), dtype)
+        for start in share:
+            rows = slice(start, min(start + TILE_ROWS, shape[0]))
+            out = [
+                part[rows].reshape(rows.stop - start, -1) for part in (result.radiance, result.variance, result.mask)
+            ]
+            for target, frame in zip(samples, ordered):
+                _load(frame.mosaic[rows], target[: rows.stop - start, MARGIN : MARGIN + out[0].shape[1]])
+            kernel(samples, start, pitch, coefficients, weights == "poisson", limits, *out)
 
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(work, _tiles(height)))
+        list(pool.map(work, (tiles[number::workers] for number in range(workers))))
     return result
 
 
-def _tied(frame: Exposed, frames: Sequence[Exposed]) -> bool:
-    return sum(other.exposure == frame.exposure for other in frames) > 1
+def _digest(mosaic: np.ndarray) -> bytes:
+    """What tells frames of one exposure apart."""
+    digest = hashlib.sha256()
+    for start in range(0, mosaic.shape[0], TILE_ROWS):
+        digest.update(np.ascontiguousarray(mosaic[start : start + TILE_ROWS]).data)
+    return digest.digest()
 
 
-def _tiles(height: int) -> Iterator[tuple[slice, slice, slice]]:
-    """Rows with halo, the rows wanted within them, and where these go."""
-    for start in range(0, height, TILE_ROWS):
-        stop = min(start + TILE_ROWS, height)
-        first = max(start - HALO, 0)
-        yield slice(first, min(stop + HALO, height)), slice(start - first, stop - first), slice(start, stop)
+def _load(rows: np.ndarray, target: np.ndarray) -> None:
+    """Copy rows of DN to (h, S); infinite samples become NaN."""
+    target[:] = np.reshape(rows, target.shape)
+    if target.dtype.kind == "f":
+        target[~np.isfinite(target)] = np.nan
 
 
-def _merge_rows(frames: Sequence[Exposed], rows: slice, weights: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Radiance, variance and mask of some rows; frames sorted from the shortest."""
-    signals = [frame.signal(rows) for frame in frames]
-    shape = signals[0].shape
-    used = [_usable(frame, signal, first=i == 0) for i, (frame, signal) in enumerate(zip(frames, signals))]
-    weight = [use * (np.float32(frame.exposure) / tiled(frame.noise.shot, shape)) for use, frame in zip(used, frames)]
-    numerator, total = _sums(frames, signals, weight)
-    if weights == "optimal":
-        around = np.maximum(_ratio(_around(numerator), _around(total)), 0)
-        weight = [use / _variance(frame, around) for use, frame in zip(used, frames)]
-        numerator, total = _sums(frames, signals, weight)
-    seen = total > 0
-    radiance = _ratio(numerator, total)
-    variance, ghost = _spread(frames, signals, used, weight, radiance, total)
-    mask = np.where(seen, 0, CLIPPED).astype(np.uint32)
-    mask |= np.where(ghost, np.uint32(GHOST), np.uint32(0))
-    mask |= np.where(seen & (radiance < np.sqrt(variance)), np.uint32(DARK), np.uint32(0))
-    bound = np.fmax(signals[0], tiled(frames[0].limit, shape)) / np.float32(frames[0].exposure)
-    return np.where(seen, radiance, bound), np.where(seen, variance, np.float32(np.inf)), mask
+def _coefficients(frame: Exposed, phase: int) -> np.ndarray:
+    """(8 * WINDOW,) float32 of `merge_kernel.merge_block` for rows with ``row % 2 == phase``."""
+    g = frame.exposure
+    period = 2 if frame.mosaic.ndim == 2 else frame.mosaic.shape[2]
+    columns = (np.arange(merge_kernel.WINDOW) - MARGIN) % period
+
+    def of_row(cell: np.ndarray) -> np.ndarray:
+        whole = np.broadcast_to(np.asarray(cell, float), (2, period))
+        return whole[phase][columns]
+
+    black, limit = of_row(frame.black), of_row(frame.limit)
+    shot, floor = (np.maximum(of_row(cell), least) for cell, least in (
+        (frame.noise.shot, LEAST_SHOT), (frame.noise.floor, LEAST_FLOOR)
+    ))  # fmt: skip
+    scale = 1 / ((frame.white - black) * g)
+    rows = [black, scale, shot / g, floor / g**2, limit / g, g / shot, floor / shot**2]
+    return np.concatenate([*rows, merge_kernel.BRIGHT_RATIO * floor / (shot * g)]).astype(np.float32)
 
 
-def _variance(frame: Exposed, radiance: np.ndarray) -> np.ndarray:
-    """Variance of one frame's estimate of a radiance (h, W) that is not negative."""
-    g, shape = np.float32(frame.exposure), radiance.shape
-    return tiled(frame.noise.shot, shape) / g * radiance + tiled(frame.noise.floor, shape) / (g * g)
-
-
-def _spread(
-    frames: Sequence[Exposed],
-    signals: list[np.ndarray],
-    used: list[np.ndarray],
-    weight: list[np.ndarray],
-    radiance: np.ndarray,
-    total: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variance of the weighted mean, and where the frames disagree beyond it; there the variance is what they show."""
-    level = np.maximum(radiance, 0)
-    spread, chi2, count = (np.zeros_like(radiance) for _ in range(3))
-    for frame, signal, use, w in zip(frames, signals, used, weight):
-        noise = _variance(frame, level)
-        spread += w * w * noise
-        if len(frames) > 1:
-            misfit = np.where(use, signal / np.float32(frame.exposure) - radiance, 0)
-            chi2 += misfit * misfit / (noise + (np.float32(RATIO_ERROR) * level) ** 2)
-            count += use
-    variance = _ratio(spread, total * total)
-    ghost = (count > 1) & (chi2 > _chi2_limit(count - 1))
-    return np.where(ghost, variance * chi2 / np.maximum(count - 1, 1), variance), ghost
-
-
-def _sums(
-    frames: Sequence[Exposed], signals: list[np.ndarray], weight: list[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    numerator, total = np.zeros_like(signals[0]), np.zeros_like(signals[0])
-    for frame, signal, w in zip(frames, signals, weight):
-        weighted = np.multiply(w, signal, out=np.zeros_like(signal), where=w > 0)  # 0 * NaN is NaN
-        numerator += weighted / np.float32(frame.exposure)
-        total += w
-    return numerator, total
-
-
-def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """Quotient, 0 where the denominator is 0."""
-    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0)
-
-
-def _around(values: np.ndarray) -> np.ndarray:
-    """Sum over the eight nearest photosites of the same colour, the photosite itself left out; mirrored at the edge."""
-    padded = np.pad(values, 2, mode="reflect" if min(values.shape) > 2 else "edge")
-    height, width = values.shape
-    rows = padded[:height] + padded[2 : 2 + height] + padded[4 : 4 + height]
-    return rows[:, :width] + rows[:, 2 : 2 + width] + rows[:, 4 : 4 + width] - values
-
-
-def _usable(frame: Exposed, signal: np.ndarray, first: bool) -> np.ndarray:
-    """(h, W) bool: the sample is finite and not clipped, decided without its own noise (see the module's text).
-
-    The shortest frame has nothing to fall back on and is cut at the limit itself.
-    """
-    limit = tiled(frame.limit, signal.shape)
-    used = signal < limit
-    if frame.mosaic.dtype.kind == "f":
-        used &= np.isfinite(signal)
-    if first:
-        return used
-    sigma = np.sqrt(frame.noise.variance(float(frame.limit.max())).max())
-    near = used & (signal > limit - np.float32(5 * sigma))
-    rows, columns = np.nonzero(near)
-    if len(rows):
-        height, width = signal.shape
-        total = np.zeros(len(rows), np.float32)
-        for dy, dx in NEIGHBOURS:
-            total += signal[_mirror(rows + dy, height), _mirror(columns + dx, width)]
-        threshold = limit if limit.ndim == 0 else limit[rows, columns]
-        used[rows, columns] = total / len(NEIGHBOURS) < threshold - np.float32(2 * sigma)
-    return used
+def _chi2_limits(frames: int) -> np.ndarray:
+    """(frames + 1,) chi-square at GHOST_SIGMA of as many frames (Wilson and Hilferty 1931, within 2 % here)."""
+    k = np.maximum(np.arange(frames + 1) - 1, 1)
+    limits = k * (1 - 2 / (9 * k) + GHOST_SIGMA * np.sqrt(2 / (9 * k))) ** 3
+    limits[:2] = np.inf  # one frame cannot disagree
+    return limits.astype(np.float32)
 
 
 def _mirror(index: np.ndarray, size: int) -> np.ndarray:
     """Index reflected at the ends, which keeps its CFA parity; clipped where the picture is smaller than that."""
     index = np.abs(index)
     return np.clip(np.where(index >= size, 2 * (size - 1) - index, index), 0, size - 1)
-
-
-def _chi2_limit(freedom: np.ndarray) -> np.ndarray:
-    """Chi-square at GHOST_SIGMA (Wilson and Hilferty 1931, within 2 % here)."""
-    k = np.maximum(freedom, 1)
-    return k * (1 - 2 / (9 * k) + GHOST_SIGMA * np.sqrt(2 / (9 * k))) ** 3
 
 
 def replace_defects(merged: Merged) -> tuple[Merged, int]:
