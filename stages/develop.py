@@ -21,38 +21,67 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import ACESCG, CAMERA_RGB, CLIPPED, DARK
-from pipeline.image import colour
-from pipeline.image.demosaic import REACH, Method, demosaic, demosaic_variance, dilate
-from pipeline.image.radiometry import tiled
+from pipeline.conventions import ACESCG, CAMERA_RGB, CLIPPED
+from pipeline.image import colour, sensitivities
+from pipeline.image.charted import read_chart, with_chart
+from pipeline.image.demosaic import Method, balanced_rgb
+from pipeline.image.vignetting import Losses
 from pipeline.run.artifacts import FACTS, MOSAICS, PHOTOGRAPHS
 from pipeline.run.errors import ArtifactError
 from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
 
+CHART, FLAT = "chart", "flat_"  # views that are no photographs of the scene
+
 
 def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     """Photographs by view: R G B in radiance units, ACEScg; variance.RGB; mask."""
-    profiles = one_white({view: profile_of(view, raster) for view, raster in mosaics.items()})
+    warnings: list[str] = []
+    evidence: list[dict[str, Any]] = []
+    numbers: dict[str, Any] = {}
+    lens = facts.get("lens") or {}
+    flats = [view for view in mosaics if view.startswith(FLAT) and lens.get("flat")]
+    chart_view = CHART if facts.get("chart") and CHART in mosaics else "plate"
+    views = [view for view in mosaics if view not in flats and not (view == CHART == chart_view)]
+    profiles = {view: profile_of(view, raster) for view, raster in mosaics.items()}
+    losses = Losses(lens, {view: mosaics[view] for view in flats}, profiles)
+    if facts.get("chart"):
+        seen = losses.corrected(mosaics[chart_view], profiles[chart_view])
+        charted = read_chart(facts["chart"], chart_view, seen, profiles[chart_view])
+        profiles = with_chart(profiles, plate_profile(profiles)["camera"], charted)
+        numbers["chart"] = charted.numbers
+        evidence += charted.evidence
+        warnings += charted.warnings
+    profiles = one_white(profiles)
+
+    def one(view: str) -> Raster:
+        mosaic = losses.corrected(mosaics[view], profiles[view])
+        return develop(mosaic, profiles[view], method_of(view, params.demosaic), view)
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        developed = list(
-            pool.map(lambda v: develop(mosaics[v], profiles[v], method_of(v, params.demosaic), v), mosaics)
-        )
-    photographs = dict(zip(mosaics, developed))
-    numbers = {view: _numbers(raster) for view, raster in photographs.items()}
-    warnings, evidence = [], [_vignetting()]
+        photographs = dict(zip(views, pool.map(one, views)))
+    numbers |= {"views": {view: _numbers(raster) for view, raster in photographs.items()}, **losses.numbers}
+    evidence = [*losses.evidence(views, profiles, {view: mosaics[view].shape for view in views}), *evidence]
+    warnings += losses.warnings
     plate = plate_profile(profiles)
-    if plate["as_shot_neutral"] is None and plate["space"] == CAMERA_RGB:
+    if plate["as_shot_neutral"] is None and plate["space"] == CAMERA_RGB and "fitted" not in plate:
         warnings.append(f"{plate['file']}: no AsShotNeutral; the scene's white is taken as D65")
-    for profile in {profile["camera"]: profile for profile in profiles.values()}.values():
-        if profile["space"] != CAMERA_RGB:
-            evidence.append(_known_space(profile))
-        elif profile["color_matrix_2"] is None:
-            evidence.append(_one_matrix(profile))
+    shown = {profiles[view]["camera"]: profiles[view] for view in views}
+    for profile in shown.values():
+        evidence += _of_profile(profile)
         if profile["camera"] != plate["camera"]:
             evidence.append(_other_camera(profile))
-    return Result({"photographs": photographs}, {"views": numbers}, warnings, evidence)
+    return Result({"photographs": photographs}, numbers, warnings, evidence)
+
+
+def _of_profile(profile: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a camera's colours rest on."""
+    if profile["space"] != CAMERA_RGB:
+        return [_known_space(profile)]
+    if profile["color_matrix"] is None:
+        return []
+    return [_adaptation(profile)] + [_one_matrix(profile)] * (profile["color_matrix_2"] is None)
 
 
 def method_of(view: str, asked: Method) -> Method:
@@ -73,6 +102,8 @@ def profile_of(view: str, mosaic: Raster) -> dict[str, Any]:
         raise ArtifactError(f"{view}: mosaic carries no colour profile; run merge again") from error
     for key in ("color_matrix", "color_matrix_2", "as_shot_neutral", "forward_matrix", "forward_matrix_2"):
         profile[key] = None if profile.get(key) is None else np.array(profile[key], float)
+    if profile["color_matrix"] is None and (known := sensitivities.known_profile(profile["camera"])):
+        profile |= known | {"source": "measured sensitivities of this model (colour-science)"}
     profile["space"] = mosaic.space
     return dict(profile)
 
@@ -105,6 +136,8 @@ def one_white(profiles: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 def acescg_of(profile: dict[str, Any], where: str) -> np.ndarray:
     """(3, 3) from the view's data to ACEScg. Raises CaptureError for camera_rgb without a usable ColorMatrix."""
+    if "fitted" in profile:
+        return np.asarray(profile["fitted"])
     if profile["space"] != CAMERA_RGB:
         return colour.matrix(profile["space"], "acescg")
     return colour.acescg_from_camera(
@@ -122,37 +155,17 @@ def acescg_of(profile: dict[str, Any], where: str) -> np.ndarray:
 def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str) -> Raster:
     """One view, a mosaic or data that have all three channels. Raises CaptureError without a usable ColorMatrix."""
     acescg_from_camera = acescg_of(profile, where)
-    cfa = str(mosaic.attributes["insitu:cfa"])
-    if cfa:
-        # the row sums of the inverse are the camera's response to ACEScg white: the neutral, green = 1
-        neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
-        camera_rgb, variance, mask = _interpolated(mosaic, cfa, neutral, method)
-        matrix = acescg_from_camera * neutral  # of white balanced camera_rgb
-    else:
-        camera_rgb, variance, mask = mosaic.rgb(), mosaic.rgb("variance"), mosaic["mask"]
-        matrix = acescg_from_camera
-    unknown = ~np.isfinite(variance).all(-1) if not cfa else mask & CLIPPED > 0
+    # the row sums of the inverse are the camera's response to ACEScg white: the neutral, green = 1
+    neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
+    camera_rgb, variance, mask = balanced_rgb(mosaic, neutral, method)
+    matrix = acescg_from_camera * neutral
+    unknown = ~np.isfinite(variance).all(-1) | (mask & CLIPPED > 0)
     rgb = colour.apply_matrix(matrix, camera_rgb)
     # infinity times a zero coefficient would be NaN: infinite variances are put back after the sums
-    spread = colour.apply_matrix(matrix**2, np.where(unknown[..., None], 0, variance))
+    variance[unknown] = 0
+    spread = colour.apply_matrix(matrix**2, variance)
     spread[unknown] = np.inf
     return Raster({**Raster.split(rgb), **Raster.split(spread, "variance"), "mask": mask}, ACESCG)
-
-
-def _interpolated(
-    mosaic: Raster, cfa: str, neutral: np.ndarray, method: Method
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """White balanced camera_rgb (H, W, 3) of a mosaic, its variance, and the mask spread by the kernels' reach."""
-    gains = tiled(np.array([1 / neutral["RGB".index(letter)] for letter in cfa]).reshape(2, 2), mosaic.shape)
-    variance = mosaic["variance"] * gains * gains
-    known = np.where(np.isfinite(variance), variance, 0)
-    mask = _spread_mask(mosaic["mask"], REACH[method])
-    return demosaic(mosaic["Y"] * gains, cfa, method), demosaic_variance(known, cfa, method), mask
-
-
-def _spread_mask(mask: np.ndarray, reach: int) -> np.ndarray:
-    """Bits of every photosite that a pixel's kernel can touch; DARK stays with its photosite, for it is no defect."""
-    return dilate(mask & ~np.uint32(DARK), reach) | (mask & np.uint32(DARK))
 
 
 def _numbers(photograph: Raster) -> dict[str, Any]:
@@ -166,13 +179,24 @@ def _numbers(photograph: Raster) -> dict[str, Any]:
     }
 
 
-def _vignetting() -> dict[str, Any]:
-    return {
-        "term": "vignetting",
-        "modelled": False,
-        "because": "no flat field was given",
-        "could_cost": "radiance low by about the cosine to the fourth of the field angle at the corners",
-    }
+def _adaptation(profile: dict[str, Any]) -> dict[str, Any]:
+    """Which white was found, and whether it lies between the calibrations."""
+    neutral = profile["as_shot_neutral"]
+    if neutral is None:
+        neutral = profile["color_matrix"] @ colour.xyz_of_xy(colour.REC709_CHROMATICITIES[3])
+    keys = ("color_matrix_2", "illuminant", "illuminant_2")
+    white = colour.camera_white(profile["color_matrix"], neutral, *(profile[key] for key in keys))[1]
+    kelvin, range_ = (
+        colour.temperature_of_xy(white[:2] / white.sum()),
+        colour.kelvin_of(*(profile[k] for k in keys[1:])),
+    )
+    text = f"white x {white[0] / white.sum():.4f}, y {white[1] / white.sum():.4f} ({kelvin:.0f} K) of {profile['file']}"
+    source = profile.get("source", "ForwardMatrix" if profile["forward_matrix"] is not None else "ColorMatrix")
+    cost = "surfaces whose colour changes with the light by more than a Bradford adaptation"
+    if profile["color_matrix_2"] is not None and range_ and not min(range_) <= kelvin <= max(range_):
+        cost += f"; the calibrations end at {min(range_):.0f} and {max(range_):.0f} K, the nearer one is held"
+    because = f"{text}, by {source}, becomes ACEScg's white"
+    return {"term": "chromatic adaptation", "modelled": True, "because": because, "could_cost": cost}
 
 
 def _one_matrix(profile: dict[str, Any]) -> dict[str, Any]:

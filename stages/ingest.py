@@ -266,11 +266,18 @@ def _brackets(
     tables = {"plate": ("plate", facts.plate.files)}
     tables |= {ball.name: (f"ball[{i}]", ball.files) for i, ball in enumerate(facts.ball)}
     tables |= {lens.name: (f"probe.fisheye[{i}]", lens.files) for i, lens in enumerate(lenses) if lens.files}
+    if facts.chart is not None and facts.chart.files:
+        tables["chart"] = ("chart", facts.chart.files)
     stated = _stated_exposures(facts, root, manifest, problems)
     listing = {}
     for name, (table, wanted) in tables.items():
         listing[name], found = resolve_files(wanted, root, f"{manifest}: {table}.files")
         problems.extend(found)
+    flats, found = resolve_files(facts.lens.flat if facts.lens else [], root, f"{manifest}: lens.flat")
+    problems.extend(found)
+    for number, flat in enumerate(flats, 1):  # a view each: the light may change between them
+        name = f"flat_{number}"
+        tables[name], listing[name] = ("lens", []), [flat]
 
     def read(path: Path) -> Frame | str:
         try:

@@ -30,6 +30,7 @@ KNOW_STAGES = {"pipeline/run/cli.py"}
 BRIDGES = {
     "cv2": {
         "pipeline/camera/opencv_bridge.py",
+        "pipeline/image/chart_finder.py",
         "pipeline/image/jpeg.py",
         "pipeline/light/sampling.py",
         "pipeline/run/formats.py",
@@ -64,7 +65,12 @@ BRIDGES = {
     },
     "pi_heif": {"pipeline/image/encoded.py"},
     "PyOpenColorIO": {"pipeline/image/display.py"},
-    "colour": {"pipeline/simulation/spectra.py"},  # spectra; its matrices are constants here, tested against it
+    "colour": {  # spectra, charts, delta E; its matrices are constants here, tested against it
+        "pipeline/image/chart.py",
+        "pipeline/image/sensitivities.py",
+        "pipeline/simulation/spectra.py",
+    },
+    "lensfunpy": {"pipeline/image/vignetting.py"},
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
     "flip_evaluator": {"pipeline/image/metrics.py"},
     "skimage": {"pipeline/image/metrics.py"},

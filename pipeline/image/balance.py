@@ -85,14 +85,14 @@ def reflectance_of(kind: str, stated: np.ndarray | None, cells: int) -> np.ndarr
 
 def cells_across(outlines: list[np.ndarray], kind: str) -> int:
     """Cells along a side, so that one has enough pixels in the view that shows the reference smallest."""
-    smallest = min(_area(outline) for outline in outlines)
+    smallest = min(area(outline) for outline in outlines)
     if kind == "chart":
         patch = smallest * (1 - 2 * PATCH_INNER) ** 2 / (CHART_ROWS * CHART_COLUMNS)
         return int(np.clip(np.sqrt(patch / (2 * FEWEST_PIXELS)), 1, 3))
     return int(np.clip(np.sqrt(smallest * (1 - 2 * INNER) ** 2 / (2 * FEWEST_PIXELS)), 1, MOST_CELLS))
 
 
-def _area(outline: np.ndarray) -> float:
+def area(outline: np.ndarray) -> float:
     """Area of a polygon (N, 2), px^2."""
     x, y = outline.T
     return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))

@@ -17,6 +17,9 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.conventions import CLIPPED, DARK
+from pipeline.types import Raster
+
 Method = Literal["bilinear", "malvar", "menon"]
 Kernel = dict[tuple[int, int], float]  # (dy, dx) -> coefficient
 
@@ -104,6 +107,28 @@ def _apply(mosaic: np.ndarray, cfa: str, method: str, power: int) -> np.ndarray:
 def _pad_cells(values: np.ndarray, padding: tuple[tuple[int, int], tuple[int, int]]) -> np.ndarray:
     """Mirrored border; pictures too small to mirror repeat their cells."""
     return np.pad(values, padding, mode="reflect" if min(values.shape) > max(max(padding)) else "wrap")
+
+
+def balanced_rgb(merged: Raster, neutral: np.ndarray, method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """White balanced camera_rgb (H, W, 3), its variance, and the mask (H, W), of merged data.
+
+    A mosaic (``insitu:cfa``) is balanced by the camera's response to white (3,) first, so that interpolation does not
+    colour edges; bits spread as far as the kernels reach, and variances are infinite where a clipped photosite entered.
+    """
+    cfa = str(merged.attributes["insitu:cfa"])
+    if not cfa:
+        gains = (1 / neutral).astype(np.float32)
+        return merged.rgb() * gains, merged.rgb("variance") * gains**2, merged["mask"]
+    cell = np.array([1 / neutral["RGB".index(letter)] for letter in cfa], np.float32).reshape(2, 2)
+    height, width = merged.shape
+    gains = np.tile(cell, ((height + 1) // 2, (width + 1) // 2))[:height, :width]
+    variance = merged["variance"] * gains * gains
+    known = np.where(np.isfinite(variance), variance, 0)
+    # DARK stays with its photosite, for it is no defect
+    mask = dilate(merged["mask"] & ~np.uint32(DARK), REACH[method]) | (merged["mask"] & np.uint32(DARK))
+    spread = demosaic_variance(known, cfa, method)
+    spread[mask & CLIPPED > 0] = np.inf
+    return demosaic(merged["Y"] * gains, cfa, method), spread, mask
 
 
 def dilate(mask: np.ndarray, reach: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
 from pipeline.run.noise_facts import NoiseFacts
 from pipeline.run.probe_facts import BALL_KINDS, PROBE_KINDS, ProbeFacts
@@ -195,6 +196,8 @@ class CaptureFacts(Strict):
     room: RoomFacts | None = None
     occluder: list[OccluderFacts] = Field([])
     reference: list[ReferenceFacts] = Field([])
+    chart: ChartFacts | None = None
+    lens: LensFacts | None = None
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
 
     @model_validator(mode="after")
@@ -206,6 +209,9 @@ class CaptureFacts(Strict):
             raise ValueError(f"ball: probe.kind = {self.probe.kind} looks at no ball; take the [[ball]] tables out")
         if "plate" in names or len(set(names)) < len(names):
             raise ValueError(f"ball names are {names}; each must be unique and none may be 'plate'")
+        taken = [name for name in names if name == "chart" or name.startswith("flat_")]
+        if taken:
+            raise ValueError(f"ball names {taken} are those of photographs of [chart] and [lens]; choose others")
         views = {"plate", *names}
         unknown = [pose.view for pose in self.pose if pose.view not in views]
         if unknown:
