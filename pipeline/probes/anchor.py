@@ -1,9 +1,9 @@
 """The ball's centre by the plane that it mirrors: the rim says where the outline is, the plane's image says it better.
 
 A mirror's rim continues its background, so that one side of it can drift by a pixel and more. The plane's texture is
-seen twice, directly and in the ball, and where its mirror image lies depends on the centre alone
-(`ball_shape.centre_from_plane`). Both are joined by their covariances; where they contradict each other, a plane whose
-patches agree to a third of a pixel is believed. Needs a plane with texture near the ball, and the ball standing on it.
+seen twice, directly and in the ball, and where its mirror image lies depends on the centre alone (`plane_image`). Both
+are joined by their covariances; where they contradict each other, a plane that agrees with its image to a third of a
+pixel is believed. Needs a plane with texture near the ball, and the ball standing on it.
 """
 
 from __future__ import annotations
@@ -14,16 +14,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import transform_points
-from pipeline.probes import ball_shape, sphere_fit
-from pipeline.probes.ball_pairs import neighbourhood, plane_pairs
+from pipeline.probes import plane_image, sphere_fit
 from pipeline.probes.finding import Found
 from pipeline.types import Camera, Raster, View
 
-ROUNDS = 3  # each about the moved centre: patches are matched where they lie
-MOST_LEFT_PX = 0.6  # that patches may leave: 0.1 to 0.2 on two captures
-RIM = 0.97  # outermost radius whose pixels are compared
+MOST_LEFT_PX = 0.6  # that the alignment may leave: 0.03 to 0.2 on simulated balls
 MOST_CHI2 = 25.0  # of the two centres, 3 degrees of freedom: beyond, one of them is wrong
-SURE_PX = 0.35  # that patches may leave to be believed against the rim
+SURE_PX = 0.35  # that it may leave to be believed against the rim
 MOST_MOVED_PX, MOST_HEIGHT_SIGMA = 4.0, 3.0  # and how far it may be then: dents can look like a centre that is farther
 
 
@@ -33,26 +30,20 @@ def anchored(
     """The ball with its centre joined with the mirrored plane's, and what that measured; as it was where it cannot."""
     if not ball.on_plane:
         return ball, {"used": False, "why": "the ball is not on the plane"}
-    moved, covariance, left = np.zeros(3), np.zeros((3, 3)), 0.0
-    centre = ball.fit.centre
-    for _ in range(ROUNDS):
-        sight = neighbourhood(photograph, camera, view.world_from_camera, centre, radius)
-        shifts = ball_shape.patch_shifts(plane_pairs(sight, RIM, every=True))
-        found = ball_shape.centre_from_plane(sight, ball.fit.radius_px / sight.binned, shifts)
-        if found is None:
-            return ball, {"used": False, "why": "too little of the plane's texture is mirrored"}
-        step, covariance, left = found
-        centre = centre + step
+    aligned = plane_image.align(photograph, camera, view, ball.fit.centre, radius, ball.fit.blur_px)
+    if aligned is None:
+        return ball, {"used": False, "why": "too little of the plane's texture is mirrored"}
+    centre, covariance = aligned.centre, aligned.covariance
     moved = centre - ball.fit.centre
     chi2 = float(moved @ np.linalg.solve(ball.fit.covariance + covariance, moved))
     pixels = float(np.linalg.norm(moved - (moved @ centre) / (centre @ centre) * centre) * ball.fit.radius_px / radius)
-    numbers = {"moved_px": pixels, "chi2": chi2, "left_px": left}
-    if left > MOST_LEFT_PX:
+    numbers = {"moved_px": pixels, "chi2": chi2, "left_px": aligned.left_px}
+    if aligned.left_px > MOST_LEFT_PX:
         return ball, {"used": False, "why": "no sphere fits the plane's mirror image", **numbers}
     numbers["against_the_rim"] = chi2 > MOST_CHI2
     if chi2 <= MOST_CHI2:
         fit = sphere_fit.joined(ball.fit, radius, moved, covariance, camera)
-    elif left <= SURE_PX and pixels <= MOST_MOVED_PX and stands(ball, centre, covariance, radius):
+    elif aligned.left_px <= SURE_PX and pixels <= MOST_MOVED_PX and stands(ball, centre, covariance, radius):
         seen = replace(ball.free, centre=centre, covariance=covariance)
         fit = sphere_fit.standing(seen, radius, ball.height, camera)
     else:

@@ -101,8 +101,10 @@ def neighbourhood(
     )
 
 
-def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False) -> Pairs:
+def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: int | None = None) -> Pairs:
     """Pairs of one view; of ``every`` pixel, with fewer rays each, for what needs a picture of them.
+
+    ``split``: rays per axis and pixel, if others than usual.
 
     Left out: incidence beyond ``limit``, points nearer to or farther from the foot than a few radii, out of the frame,
     hidden by the ball, and whatever touches an invalid or clipped pixel. The way from the ball to the plane is free:
@@ -111,7 +113,7 @@ def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False) -> Pairs
     picture, camera, world_from_camera = sight.picture, sight.camera, sight.world_from_camera
     centre, radius = sight.centre, sight.radius
     px = ball_pixels(sight, 1 if every else pixel_step(sight))
-    split = SPLIT // 2 if every else SPLIT
+    split = split or (SPLIT // 2 if every else SPLIT)
     spread = ((np.arange(split) + 0.5) / split - 0.5) * 2  # +- 1 px about the centre
     dx, dy = (part.ravel() for part in np.meshgrid(spread, spread))
     share = (1 - np.abs(dx)) * (1 - np.abs(dy))

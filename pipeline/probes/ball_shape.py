@@ -9,7 +9,7 @@ The outline is no witness: a mirror's rim continues its background, so single st
 only. Harmonics 2 to 6 of perfect balls of 80 to 106 px, ray-traced and captured, came out at 0.2 to 0.9 px rms, by
 steepest slopes, by a path through all of them, and by a model of the light on both sides: 1 to 11 degrees of direction,
 where the mirrored plane shows half a degree. For the same reason the plane's image knows the centre better than the rim
-does (`centre_from_plane`).
+does (`plane_image`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ PATCH, REACH = 13, 7  # side of a patch, and largest shift that is looked for [p
 MAX_SIGMA_PX = 0.35  # patches that know their place worse have too little texture
 MIN_PATCHES = 8
 FLOOR_PX = 0.3  # of a perfect ball: on ray-traced ones 0.1, on two demosaicked captures 0.2 to 0.3
-# Of the centre by the mirrored plane: what patches share, against known centres on two captures 0.05 to 0.17 px.
-COMMON_PX, MAX_CONDITION = 0.15, 1e6
 SIGNIFICANT, OPEN_SIGMA = 3.0, 3.0
 TOO_DENTED = 0.1  # rad: of order l, exp(-l (l + 1) s^2 / 2) is left: 97 % of order 2, half of order 11
 GLASS_INDEX = 1.52  # soda-lime
@@ -143,7 +141,7 @@ def dents(
     if len(centre) < MIN_PATCHES:
         return None
     # Another centre is no dent, as far as the fit leaves it open; beyond, dents look like one.
-    moved, _, _ = _centre_shift(by_centre, shift, error)
+    moved = _centre_shift(by_centre, shift, error)
     astray = float(np.sqrt(moved @ np.linalg.solve(covariance, moved)))
     shift = shift - by_centre @ (moved * min(1.0, OPEN_SIGMA / max(astray, 1e-12)))
     arm = (centre + 0.5 - project(sight.camera, sight.centre[None])[0]) / radius_px
@@ -158,41 +156,16 @@ def dents(
     return Dents(len(arm), rms, angle, noise, moved)
 
 
-def centre_from_plane(
-    sight: Sight, radius_px: float, shifted: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Where the plane's mirror image puts the ball's centre: its move (3,) [m], camera frame, covariance (3, 3), and
-    the rms shift [px] that is left. None with too few patches, or where these leave a direction open.
-
-    Patches overlap by half, so a quarter of them counts. What they have in common, the pose's error before all, is
-    `COMMON_PX` across the ray and the same of the radius along it.
-    """
-    centre, shift, error = shifted
-    if len(centre) < MIN_PATCHES:
-        return None
-    by_centre = _by_centre(sight, centre + 0.5)
-    known = np.isfinite(by_centre).all((1, 2))
-    if known.sum() < MIN_PATCHES:
-        return None
-    moved, normal, left = _centre_shift(by_centre[known], shift[known], error[known])
-    if np.linalg.cond(normal) > MAX_CONDITION:
-        return None
-    distance = float(np.linalg.norm(sight.centre))
-    ray, pixel = sight.centre / distance, sight.radius / radius_px
-    common = pixel**2 * np.eye(3) + ((pixel * distance / sight.radius) ** 2 - pixel**2) * np.outer(ray, ray)
-    return moved, 4 * np.linalg.inv(normal) + COMMON_PX**2 * common, left
-
-
-def _centre_shift(by_centre: np.ndarray, shift: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Robust least squares of shifts (N, 2) by the centre: its move (3,) [m], normal matrix, rms [px] that is left."""
+def _centre_shift(by_centre: np.ndarray, shift: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Robust least squares of shifts (N, 2) by the centre: its move (3,) [m]."""
     columns, target, own = by_centre.reshape(-1, 3), shift.ravel(), np.repeat(1 / np.hypot(error, FLOOR_PX) ** 2, 2)
-    weight, moved, spread = own, np.zeros(3), 0.0
+    weight, moved = own, np.zeros(3)
     for _ in range(10):
         moved = np.linalg.solve(columns.T @ (weight[:, None] * columns), columns.T @ (weight * target))
         left = (target - columns @ moved).reshape(-1, 2)
         spread = float(np.sqrt(np.median((left**2).sum(1)) / (2 * np.log(2)))) + 1e-9
         weight = own / np.repeat(1 + (left**2).sum(1) / (2 * max(spread, FLOOR_PX)) ** 2, 2)
-    return moved, columns.T @ (weight[:, None] * columns), spread
+    return moved
 
 
 def _by_centre(sight: Sight, px: np.ndarray) -> np.ndarray:
