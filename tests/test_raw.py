@@ -79,8 +79,9 @@ def test_odd_active_area_keeps_its_colours(tmp_path):
     path = write(tmp_path / "a.dng", ramp())
     data = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as tiff:
-        offset = tiff.pages[0].tags[50829].valueoffset
-    data[offset : offset + 16] = np.array([1, 3, 59, 77], "<u4").tobytes()
+        area, crop = (tiff.pages[0].tags[code].valueoffset for code in (50829, 50720))
+    data[area : area + 16] = np.array([1, 3, 59, 77], "<u4").tobytes()
+    data[crop : crop + 8] = np.array([74, 58], "<u4").tobytes()
     path.write_bytes(data)
     frame = read_metadata(path)
     assert (frame.width, frame.height, frame.cfa) == (74, 58, "RGGB")  # DNG: the pattern starts at the active area

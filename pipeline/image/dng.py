@@ -113,6 +113,13 @@ def active_area(tags: Tags) -> Box:
     if area is None:
         return 0, 0, height, width
     top, left, bottom, right = (int(value) for value in area)
+    origin, size = numbers(tags, 50719), numbers(tags, 50720)
+    if size is not None and size.size == 2:
+        needed = size + (np.zeros(2) if origin is None else origin)
+        if needed[0] > right - left + 1 or needed[1] > bottom - top + 1:  # both are rationals, and some round up
+            raise ValueError(f"ActiveArea {area.tolist()} does not hold the default crop {needed.tolist()}")
+    if any(t < bottom and top < b and le < right and left < r for t, le, b, r in masked_areas(tags)):
+        raise ValueError(f"ActiveArea {area.tolist()} overlaps MaskedAreas")
     if not (0 <= top < bottom <= height and 0 <= left < right <= width):
         raise ValueError(f"ActiveArea {area.tolist()} lies outside the picture")
     return top, left, bottom, right

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.image.dng import floating
-from pipeline.image.tags import Tags, numbers, tags_of, whole
+from pipeline.image.tags import Tags, numbers, occupied, tags_of, whole
 from pipeline.run.errors import CaptureError
 
 NONE, JPEG, DEFLATE, LOSSY_JPEG, JPEG_XL = 1, 7, 8, 34892, 52546
@@ -63,7 +63,7 @@ class Layout:
         return top, left, min(self.piece[0], self.height - top), min(self.piece[1], self.width - left)
 
 
-def layout_of(name: str, page: Any, pages: list[Any], file_size: int) -> Layout:
+def layout_of(name: str, tiff: Any, page: Any, pages: list[Any], file_size: int) -> Layout:
     """Layout of a raw directory, checked against the file. Raises CaptureError, one line."""
     tags = tags_of(page)
     tiled = 324 in tags
@@ -91,7 +91,7 @@ def layout_of(name: str, page: Any, pages: list[Any], file_size: int) -> Layout:
     )
     _check_coding(name, tags, layout)
     _check_pieces(name, layout, file_size)
-    _check_places(name, layout, pages)
+    check_places(name, layout.offsets, layout.counts, tiff, pages)
     return layout
 
 
@@ -149,20 +149,15 @@ def _byte_counts(layout: Layout, index: int) -> list[int]:
     return list(dict.fromkeys([rows * row, layout.piece[0] * row]))
 
 
-def _check_places(name: str, layout: Layout, pages: list[Any]) -> None:
-    """Pieces overlap neither each other nor the directories and their values: an offset that is wrong shows here."""
-    ranges = [(0, 8, "header")]
-    ranges += [(o, o + c, "picture") for o, c in zip(layout.offsets.tolist(), layout.counts.tolist())]
-    for page in pages:
-        ranges.append((page.offset, page.offset + 2 + 12 * len(page.tags), "directory"))
-        for tag in page.tags.values():
-            if tag.valuebytecount > 4:
-                ranges.append((tag.valueoffset, tag.valueoffset + tag.valuebytecount, "values"))
+def check_places(name: str, offsets: np.ndarray, counts: np.ndarray, tiff: Any, pages: list[Any]) -> None:
+    """Raises CaptureError where pieces (N,) overlap each other, a directory or its values: so a wrong offset shows."""
+    ranges = [(0, 8, "header"), *occupied(tiff, pages)]
+    ranges += [(start, start + size, "picture") for start, size in zip(offsets.tolist(), counts.tolist())]
     furthest, what = 0, ""
     for start, stop, kind in sorted(ranges):
         if start < furthest and "picture" in (kind, what):
-            raise CaptureError(f"{name}: its picture and its {what if what != 'picture' else kind} overlap at byte "
-                               f"{start}; copy the file again")  # fmt: skip
+            other = what if what != "picture" else kind
+            raise CaptureError(f"{name}: its picture and its {other} overlap at byte {start}; copy the file again")
         if stop > furthest:
             furthest, what = stop, kind
 

@@ -52,7 +52,7 @@ def measure(
     """Black of the areas of a stored picture (H, W) DN; None when none of them looks dark or all are too small.
 
     ``scale``: white - black DN. An area is dark when its samples spread less than MAX_SPREAD and lie within MAX_SHIFT
-    of the ``stated`` black (2, 2). Where areas disagree (light leaked into one) the lowest is used.
+    of the ``stated`` black (2, 2). The area with the smallest standard error is used.
     """
     found = [one for area in areas if (one := _of_area(stored, area, active, source)) is not None]
     dark = [
@@ -62,7 +62,7 @@ def measure(
     ]
     if not dark:
         return None
-    return min(dark, key=lambda one: float(one.level.mean()))
+    return min(dark, key=lambda one: float(one.sigma.sum()))
 
 
 def _of_area(stored: np.ndarray, area: Box, active: Box, source: str) -> OpticalBlack | None:

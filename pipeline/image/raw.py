@@ -18,9 +18,19 @@ import numpy as np
 
 from pipeline.image import dng, libraw, optical_black
 from pipeline.image.computational import by_metadata
-from pipeline.image.dng_data import Layout, layout_of, read_samples
+from pipeline.image.dng_data import Layout, check_places, layout_of, read_samples
 from pipeline.image.optical_black import OpticalBlack
-from pipeline.image.tags import Tags, camera_name, exif_exposure, is_tiff, main_tags, opened, tags_of
+from pipeline.image.tags import (
+    Tags,
+    camera_name,
+    check_directory,
+    exif_exposure,
+    is_tiff,
+    main_tags,
+    numbers,
+    opened,
+    tags_of,
+)
 from pipeline.run.errors import CaptureError
 from pipeline.types import Frame
 
@@ -68,12 +78,13 @@ def read_metadata(path: Path, name: str = "") -> Frame:
         raise CaptureError(f"{name}: no such file")
     facts: dict[str, Any] = {"exposure_s": 0.0, "iso": 0.0, "fnumber": 0.0}
     try:
-        if not is_tiff(path):
+        if not _may_be_dng(path):
             facts |= libraw.sensor_of(name, path)
         else:
-            with opened(path) as (_, pages):
+            with opened(path) as (tiff, pages):
                 main = main_tags(pages)
-                own = _dng_facts(name, path, pages) if dng.DNG_VERSION in main else _other_facts(name, path, pages)
+                is_dng = _is_dng(path, main)
+                own = _dng_facts(name, path, tiff, pages) if is_dng else _other_facts(name, path, tiff, pages)
                 facts |= {**own, **exif_exposure(main), "camera": camera_name(main)}
         return Frame(**facts, file=name, sha256=file_sha256(path))
     except DAMAGE as error:
@@ -89,18 +100,38 @@ def _damaged(name: str, error: Exception) -> CaptureError:
     return CaptureError(f"{name}: damaged RAW metadata ({reason}); copy the file again from the card")
 
 
-def _dng_of(name: str, path: Path, pages: list[Any]) -> _Dng:
+def _dng_of(name: str, path: Path, tiff: Any, pages: list[Any]) -> _Dng:
     page = dng.raw_page(name, pages)
+    for directory in (pages[0], page):
+        check_directory(tiff, directory)
     tags = tags_of(page)
-    layout = layout_of(name, page, pages, path.stat().st_size)
+    layout = layout_of(name, tiff, page, pages, path.stat().st_size)
     for tag in tags.values():
         _ = tag.value  # long values are read when first asked for, and the file is closed by then
     return _Dng(dng.mosaic_of(name, tags), tags, layout, dng.active_area(tags))
 
 
-def _dng_facts(name: str, path: Path, pages: list[Any]) -> dict[str, Any]:
+def _may_be_dng(path: Path) -> bool:
+    """Whether it is a TIFF. Raises ValueError where the file's name promises one: LibRaw finds pictures in wrecks."""
+    if is_tiff(path):
+        return True
+    if path.suffix.lower() == ".dng":
+        raise ValueError("no TIFF header")
+    return False
+
+
+def _is_dng(path: Path, main: Tags) -> bool:
+    """Whether the tags are a DNG's. Raises ValueError where the file's name says so and its tags do not."""
+    if dng.DNG_VERSION in main:
+        return True
+    if not main or path.suffix.lower() == ".dng":
+        raise ValueError("no DNGVersion" if main else "no directory")
+    return False
+
+
+def _dng_facts(name: str, path: Path, tiff: Any, pages: list[Any]) -> dict[str, Any]:
     """Everything a DNG says besides its exposure."""
-    file, main = _dng_of(name, path, pages), main_tags(pages)
+    file, main = _dng_of(name, path, tiff, pages), main_tags(pages)
     colour, marks = dng.colour_of(main)
     tags = file.tags
     marks += dng.oddities(name, main, tags)
@@ -119,16 +150,21 @@ def _dng_facts(name: str, path: Path, pages: list[Any]) -> dict[str, Any]:
     }
 
 
-def _other_facts(name: str, path: Path, pages: list[Any]) -> dict[str, Any]:
+def _other_facts(name: str, path: Path, tiff: Any, pages: list[Any]) -> dict[str, Any]:
     """Facts of a TIFF based RAW that is no DNG, its declared bytes counted."""
     size = path.stat().st_size
     for page in pages:
         tags = tags_of(page)
-        for code, count in ((273, 279), (324, 325)):
-            if code in tags and count in tags:
-                end = int(np.max(np.ravel(tags[code].value)) + np.ravel(tags[count].value)[-1])
-                if end > size:
-                    raise CaptureError(f"{name}: {size} bytes, its image data end at {end}; copy the file again")
+        for code, other in ((273, 279), (324, 325)):
+            offsets, counts = numbers(tags, code), numbers(tags, other)
+            if offsets is None and counts is None:
+                continue
+            if offsets is None or counts is None or len(offsets) != len(counts):
+                raise ValueError("pieces of a picture without their sizes or places")
+            if (end := int((offsets + counts).max())) > size:
+                raise CaptureError(f"{name}: {size} bytes, its image data end at {end}; copy the file again")
+            if counts.sum() > size / 2:  # the sensor data; previews may lie within a maker's note
+                check_places(name, offsets.astype(np.int64), counts.astype(np.int64), tiff, pages)
     return libraw.sensor_of(name, path)
 
 
@@ -181,11 +217,11 @@ def _dng_or_none(path: Path, frame: Frame) -> _Dng | None:
     """The DNG's directory; None for other files. Raises CaptureError when it is gone or damaged."""
     if not path.is_file():
         raise CaptureError(f"{frame.file}: no such file; restore it or run ingest again")
-    if not is_tiff(path):
-        return None
     try:
-        with opened(path) as (_, pages):
-            return _dng_of(frame.file, path, pages) if dng.DNG_VERSION in main_tags(pages) else None
+        if not _may_be_dng(path):
+            return None
+        with opened(path) as (tiff, pages):
+            return _dng_of(frame.file, path, tiff, pages) if _is_dng(path, main_tags(pages)) else None
     except DAMAGE as error:
         raise _damaged(frame.file, error) from error
 

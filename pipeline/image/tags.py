@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 RATIONAL, SRATIONAL = 5, 10  # TIFF types that tifffile returns as flat numerator, denominator pairs
+SINGLE = (256, 257, 259, 262, 277, 278, 284, 317, 322, 323)  # TIFF tags of size and coding that hold one number
+TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 MAX_DIRECTORIES = 64  # of a photograph: main, raw, previews, masks; more is a damaged chain
 
 Tags = dict[int, Any]
@@ -41,6 +45,49 @@ def is_tiff(path: Path) -> bool:
     """Whether the file starts as a TIFF does; RAW files of some makers (CRW, RAF, CR3, X3F) do not."""
     with path.open("rb") as stream:
         return stream.read(4) in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def check_directory(tiff: Any, page: Any) -> None:
+    """Raises ValueError when entries of a directory were skipped as unreadable, or are out of order.
+
+    Every reader passes over such an entry in silence, and what it said of the coding is lost. TIFF 6.0 wants entries
+    sorted by code, so that one whose code is damaged shows.
+    """
+    stream, order = tiff.filehandle, tiff.byteorder
+    stream.seek(page.offset)
+    (count,) = struct.unpack(order + "H", stream.read(2))
+    codes = [struct.unpack_from(order + "H", stream.read(12))[0] for _ in range(count)]
+    if any(one >= other for one, other in pairwise(codes)):
+        raise ValueError("directory entries out of order")
+    found = {tag.code for tag in page.tags.values()}
+    if lost := [code for code in codes if code not in found]:
+        raise ValueError(f"entry {lost[0]} of the directory cannot be read")
+    for code in SINGLE:
+        if code in found and page.tags[code].count != 1:
+            raise ValueError(f"entry {code} of the directory holds {page.tags[code].count} values, needed 1")
+
+
+def occupied(tiff: Any, pages: list[Any]) -> list[tuple[int, int, str]]:
+    """Ranges of bytes [start, stop) that directories and their longer values take, EXIF's included."""
+    ranges = []
+    for page in pages:
+        ranges.append((page.offset, page.offset + 2 + 12 * len(page.tags), "directory"))
+        for tag in page.tags.values():
+            if tag.valuebytecount > 4:
+                ranges.append((tag.valueoffset, tag.valueoffset + tag.valuebytecount, "values"))
+    exif = {tag.offset for page in pages for tag in page.tags.values() if tag.code == 34665}
+    stream, order = tiff.filehandle, tiff.byteorder
+    for entry in exif:
+        stream.seek(entry + 8)
+        (start,) = struct.unpack(order + "I", stream.read(4))
+        stream.seek(start)
+        (count,) = struct.unpack(order + "H", stream.read(2))
+        ranges.append((start, start + 2 + 12 * count, "directory"))
+        for _ in range(count):
+            _, kind, number, place = struct.unpack(order + "HHII", stream.read(12))
+            if (size := number * TYPE_BYTES.get(kind, 0)) > 4:
+                ranges.append((place, place + size, "values"))
+    return ranges
 
 
 def tags_of(page: Any) -> Tags:
