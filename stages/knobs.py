@@ -95,6 +95,9 @@ class Render(Params):
     strategy: Literal["difference", "reference"] = Field("difference", description="the change itself, or two renders")
     samples: int = Field(48, ge=1, le=65536, description="most samples per pixel; up to four times as many on objects")
     depth: int = Field(6, ge=2, le=64, description="longest path [vertices]")
+    materials: Literal["conserving", "gltf"] = Field(
+        "conserving", description="glTF materials that keep all light, or as appendix B of glTF words them"
+    )
     threshold: float = Field(0.004, ge=0, le=0.05, description="change below this fraction is left to the plate")
     denoise: bool = Field(True, description="denoise the object layer and the relative change")
     light_groups: bool = Field(False, description="layers of every light alone: sky, sun, lamps")

@@ -54,8 +54,13 @@ def world_from_object(wish: dict[str, Any], plane: Plane) -> np.ndarray:
     return matrix
 
 
-def place_objects(wishes: dict[str, Any], plane: Plane, white: float) -> tuple[dict[str, Any], list[str]]:
-    """Mitsuba shapes of every wished object, and warnings; ``white``: radiance that an emission of 1 stands for."""
+def place_objects(
+    wishes: dict[str, Any], plane: Plane, white: float, materials: str = "conserving"
+) -> tuple[dict[str, Any], list[str]]:
+    """Mitsuba shapes of every wished object, and warnings.
+
+    ``white``: radiance that an emission of 1 stands for; ``materials``: the knob.
+    """
     mi = use_mitsuba()
     shapes, warnings = {}, []
     for wish in wishes["object"]:
@@ -70,7 +75,9 @@ def place_objects(wishes: dict[str, Any], plane: Plane, white: float) -> tuple[d
                 material = Material(**given)
             name = f"{wish['name']}_{index}"
             placed = world_from_object(wish, plane)
-            shapes[name], notes = object_shape(mi, name, mesh, placed, material, space, white)
+            shapes[name], notes = object_shape(
+                mi, name, mesh, placed, material, space, white, materials == "conserving"
+            )
             warnings += notes
     return shapes, warnings
 
@@ -109,7 +116,7 @@ def compute(
             ["scene.toml: no objects; the plate comes back"],
         )
     upward = irradiance(environment.rgb(), plane.normal[None])[0]
-    shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi)
+    shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi, params.materials)
     rays = LensRays(camera, views["plate"].world_from_camera)
     plate = photographs["plate"]
     sigma = np.sqrt(sum(plate[f"variance.{c}"] for c in "RGB") / np.float32(3))
@@ -140,7 +147,7 @@ def compute(
     }
     if params.light_groups:
         # What the objects themselves send out is light of one group only, the sky's.
-        objects = {"sky": shapes, "lamp": place_objects(wishes, plane, 0.0)[0]}
+        objects = {"sky": shapes, "lamp": place_objects(wishes, plane, 0.0, params.materials)[0]}
         parts = {
             name: worlds_under(*part, objects["sky" if name == "sky" else "lamp"])
             for name, part in groups(environment.rgb(), emitters).items()

@@ -282,7 +282,9 @@ def test_manifests_validate(tiny: Path) -> None:
     assert [ball.tripod for ball in facts.ball] == [True, False]
     for pattern in [*facts.plate.files, *facts.ball[0].files, *facts.ball[1].files, *facts.camera.calibration]:
         assert list(root.glob(pattern))
-    wishes = SceneWishes.model_validate(load_toml(tiny / "scene.toml"))
+    tables = load_toml(tiny / "scene.toml")
+    assert tables.pop("render") == {"materials": "gltf"}  # what the truth is made of
+    wishes = SceneWishes.model_validate(tables)
     assert all((tiny / wish.file).is_file() for wish in wishes.object)
     assert (tiny / str(facts.truth)).is_file()
 

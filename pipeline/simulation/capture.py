@@ -204,6 +204,8 @@ def wish_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]]:
                 "yaw_deg": model.yaw_deg,
             },
         )
+    if scene.object:
+        yield "[render]", {"materials": "gltf"}  # as `World.objects` has them
 
 
 def write_manifests(scene: SimulatedScene, out: Path) -> None:

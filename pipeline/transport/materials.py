@@ -1,4 +1,6 @@
-"""The glTF 2.0 metallic-roughness material as a Mitsuba BSDF, exactly as appendix B of the specification.
+"""The glTF 2.0 metallic-roughness material as a Mitsuba BSDF: conserving, or as appendix B of the specification.
+
+Appendix B, which real-time viewers follow:
 
     dielectric = mix(base / pi, D V, F),  F = f0 + (1 - f0) (1 - |v.h|)^5
     metal      = D V (base + (1 - base) (1 - |v.h|)^5 - dip)
@@ -9,28 +11,40 @@ normal incidence, is 0.04 unless KHR_materials_ior says otherwise. ``dip`` is no
 Schlick's curve towards grazing angles, by the factor ``edge_tint`` at a cosine of 1/7 (Kutz, Hasan and Edmondson 2021);
 1, the default, is glTF.
 
-Mitsuba's own ``principled`` is another model (a white furnace differs by 6 %). The specification's mix is reciprocal,
-and keeps the energy of metals and of dielectrics seen from above; a smooth white dielectric near grazing angles gives
-back more than it gets (20 % at a cosine of 0.2 and roughness 0.3). Both sides of a face are lit, as in offline
-renderers. ``alpha`` >= 1e-3.
+It is reciprocal, but no energy is kept: Schlick's F is up to 23 % below Fresnel's at f0 = 0.04 (cosine 0.6), light
+that meets two facets is lost (3 % of a white dielectric of roughness 1, two thirds of such a metal), and a smooth white
+dielectric near grazing angles gives back more than it gets (20 % at a cosine of 0.2 and roughness 0.3). Offline
+renderers repair that, each its own way; ``conserving`` does by terms that stay reciprocal (see `energy`):
+
+    dielectric = D V F' + base / pi (1 - Ed(i)) (1 - Ed(o)) / (1 - Ed mean),  F' by Fresnel
+    metal      = D V F + Fms / pi (1 - E(i)) (1 - E(o)) / (1 - E mean),  Fms = Fmean^2 E mean / (1 - Fmean (1 - E mean))
+
+A white surface then returns all light at every angle. Both sides of a face are lit, as in offline renderers.
+``alpha`` >= 1e-3. Mitsuba's own ``principled`` is a third model (a white furnace differs by 6 %).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from pipeline.transport.conductors import GRAZING
+from pipeline.transport.energy import Kept
 
 DIELECTRIC_F0 = 0.04
 MIN_ALPHA = 1e-3
 SCHLICK_AT_EDGE = (1 - GRAZING) ** 5
 DIP_AT_EDGE = GRAZING * (1 - GRAZING) ** 6
+SCHLICK_MEAN = 1 / 21  # 2 integral of (1 - c)^5 c
+DIP_MEAN = 1 / 126 / DIP_AT_EDGE  # the same of c (1 - c)^6
 
 
 def register(mi: Any) -> None:
     """Register ``insitu_gltf`` for the current variant.
 
-    Its parameters, textures or numbers: base_color, metallic, roughness, f0, edge_tint.
+    Its parameters, textures or numbers: base_color, metallic, roughness, f0, edge_tint. ``conserving``, a flag, takes
+    f0 as one number, when it is made.
     """
     import drjit as dr
 
@@ -47,6 +61,7 @@ def register(mi: Any) -> None:
             self.roughness = props.get_texture("roughness", 0.5)
             self.f0 = props.get_texture("f0", DIELECTRIC_F0)
             self.edge_tint = props.get_texture("edge_tint", 1.0)
+            self.kept = Kept(mi, float(np.ravel(self.f0.mean())[0])) if props.get("conserving", False) else None
             side = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [mi.BSDFFlags.DiffuseReflection | side, mi.BSDFFlags.GlossyReflection | side]
             self.m_flags = self.m_components[0] | self.m_components[1]
@@ -60,17 +75,34 @@ def register(mi: Any) -> None:
             alpha = dr.maximum(dr.square(self.roughness.eval_1(si, active)), MIN_ALPHA)
             return self.base.eval(si, active), metallic, alpha, self.f0.eval_1(si, active)
 
-        @staticmethod
-        def _glossy_share(base: Any, metallic: Any, f0: Any, cos_i: Any) -> Any:
+        def _glossy_share(self, base: Any, metallic: Any, alpha: Any, f0: Any, cos_i: Any) -> Any:
             fresnel = f0 + (1 - f0) * schlick(cos_i)
+            mirror, least = 1.0, 0.1
+            if self.kept is not None:
+                mirror, fresnel = self.kept.at(cos_i, alpha)
             diffuse = (1 - metallic) * (1 - fresnel) * dr.mean(base)
-            glossy = metallic * dr.maximum(dr.mean(base), 0.1) + (1 - metallic) * fresnel
+            diffuse += metallic * dr.maximum(dr.mean(base), least) * (1 - mirror)
+            glossy = metallic * dr.maximum(dr.mean(base), least) * mirror + (1 - metallic) * fresnel
             return dr.clip(glossy / (glossy + diffuse + 1e-8), 0.05, 1.0 - 0.05 * (1 - metallic))
 
         @staticmethod
         def _flip(wi: Any, wo: Any) -> tuple[Any, Any]:
             sign = dr.sign(wi.z)
             return mi.Vector3f(wi.x, wi.y, wi.z * sign), mi.Vector3f(wo.x, wo.y, wo.z * sign)
+
+        @staticmethod
+        def _rest(kept: Kept, cos_i: Any, cos_o: Any, alpha: Any) -> tuple[Any, Any]:
+            """What the facets of a mirror and of the dielectric leave to the lobe of the rest, over pi and a cosine."""
+            left = (1 - kept.at(cos_i, alpha)) * (1 - kept.at(cos_o, alpha))
+            left /= dr.maximum(1 - kept.over_cosine(alpha), 1e-6)
+            return left[0], left[1]
+
+        @staticmethod
+        def _again(kept: Kept, base: Any, tint: Any, alpha: Any) -> Any:
+            """Colour of light that met several facets of a metal (Kulla and Conty 2017)."""
+            mean = base + (1 - base) * SCHLICK_MEAN - tint * (base + (1 - base) * SCHLICK_AT_EDGE) * DIP_MEAN
+            share = kept.over_cosine(alpha)[0]
+            return dr.square(mean) * share / (1 - mean * (1 - share))
 
         def _value_and_pdf(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             wi, wo = self._flip(si.wi, wo)
@@ -80,24 +112,28 @@ def register(mi: Any) -> None:
             lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             d = lobe.eval(half)
             glossy = d * lobe.smith_g1(wi, half) * lobe.smith_g1(wo, half) / (4 * wi.z)  # times cos(wo)
-            edge = schlick(dr.dot(wi, half))
-            fresnel = f0 + (1 - f0) * edge
-            diffuse = base * (dr.inv_pi * wo.z)
-            dielectric = diffuse * (1 - fresnel) + glossy * fresnel
-            cosine = dr.clip(dr.abs(dr.dot(wi, half)), 0.0, 1.0)
-            dip = cosine * dr.power(1.0 - cosine, 6) / DIP_AT_EDGE * (1 - self.edge_tint.eval(si, active))
+            cosine, under = dr.clip(dr.abs(dr.dot(wi, half)), 0.0, 1.0), dr.inv_pi * wo.z
+            edge, tint = schlick(cosine), 1 - self.edge_tint.eval(si, active)
+            dip = cosine * dr.power(1.0 - cosine, 6) / DIP_AT_EDGE * tint
             metal = glossy * (base + (1 - base) * edge - dip * (base + (1 - base) * SCHLICK_AT_EDGE))
+            if self.kept is None:
+                fresnel = f0 + (1 - f0) * edge
+                dielectric = base * under * (1 - fresnel) + glossy * fresnel
+            else:
+                mirror, through = self._rest(self.kept, wi.z, wo.z, alpha)
+                dielectric = glossy * mi.fresnel(cosine, self.kept.eta)[0] + base * under * through
+                metal += under * mirror * self._again(self.kept, base, tint, alpha)
             value = dielectric * (1 - metallic) + metal * metallic
-            share = self._glossy_share(base, metallic, f0, wi.z)
+            share = self._glossy_share(base, metallic, alpha, f0, wi.z)
             pdf_glossy = lobe.pdf(wi, half) / (4 * dr.dot(wo, half))
-            pdf = share * pdf_glossy + (1 - share) * dr.inv_pi * wo.z
+            pdf = share * pdf_glossy + (1 - share) * under
             return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             base, metallic, alpha, f0 = self._parameters(si, active)
             sign = dr.sign(si.wi.z)
             wi = mi.Vector3f(si.wi.x, si.wi.y, si.wi.z * sign)
-            share = self._glossy_share(base, metallic, f0, wi.z)
+            share = self._glossy_share(base, metallic, alpha, f0, wi.z)
             take_glossy = sample1 < share
             lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             half, _ = lobe.sample(wi, sample2)

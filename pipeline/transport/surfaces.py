@@ -32,12 +32,14 @@ def scalar_texture(mi: Any, value: float, texture: np.ndarray | None) -> Any:
     return {"type": "bitmap", "bitmap": bitmap, "raw": True}
 
 
-def material_bsdf(mi: Any, material: Material, space: Space = "linear_rec709") -> dict[str, Any]:
+def material_bsdf(
+    mi: Any, material: Material, space: Space = "linear_rec709", conserving: bool = True
+) -> dict[str, Any]:
     """Mitsuba description of a material whose colours are linear in ``space``.
 
     Metallic-roughness as glTF has it; a conductor takes its colours from `pipeline.transport.conductors`; the share
     ``transmission`` of it is a thick solid of refractive index ``ior`` (glTF tints a path once: each of its two
-    crossings by the root of the base colour).
+    crossings by the root of the base colour). ``conserving``: see `pipeline.transport.materials`.
     """
     color = np.asarray(material.shown_color, float)
     if material.base_texture is not None:
@@ -47,6 +49,7 @@ def material_bsdf(mi: Any, material: Material, space: Space = "linear_rec709") -
         return solid_bsdf(mi, material, color)
     described = {
         "type": "insitu_gltf",
+        "conserving": conserving,
         "base_color": color_texture(mi, color),
         "metallic": scalar_texture(mi, material.metallic, material.metallic_texture),
         "roughness": scalar_texture(mi, material.shown_roughness, material.roughness_texture),
@@ -124,10 +127,17 @@ def mesh_shape(
 
 
 def object_shape(
-    mi: Any, name: str, mesh: Mesh, world_from_mesh: np.ndarray, material: Material, space: Space, white: float
+    mi: Any,
+    name: str,
+    mesh: Mesh,
+    world_from_mesh: np.ndarray,
+    material: Material,
+    space: Space,
+    white: float,
+    conserving: bool = True,
 ) -> tuple[Any, list[str]]:
-    """A mesh as a Mitsuba shape with its material and light, and warnings; ``white`` as in `area_emitter`."""
-    bsdf, emitter = material_bsdf(mi, material, space), area_emitter(mi, material, space, white)
+    """A mesh as a Mitsuba shape with its material and light, and warnings; see `area_emitter` and `material_bsdf`."""
+    bsdf, emitter = material_bsdf(mi, material, space, conserving), area_emitter(mi, material, space, white)
     flaw = mesh.flaw_as_solid() if material.transmission else ""
     warnings = [f"{name}: lets light through, but {flaw}; it is refracted as if it were a solid"] if flaw else []
     if material.transmission and material.roughness_texture is not None:
