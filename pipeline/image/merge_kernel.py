@@ -18,14 +18,13 @@ import numpy as np
 
 from pipeline.conventions import CLIPPED, DARK, GHOST
 
-CHUNK = 192  # samples that a pass settles; a multiple of 2 and 3, so that every chunk starts on a whole cell
+CHUNK = 576  # samples that a pass settles; a multiple of 2 and 3, so that every chunk starts on a whole cell
 MARGIN = 8  # samples that it looks at on either side: two neighbours, at a pitch of up to 3
 WINDOW = CHUNK + 2 * MARGIN  # whole vectors; a fixed number, so that loops need no remainder
-ROWS = range(
-    0, 8 * WINDOW, WINDOW
-)  # where the rows begin in flat memory: the compiler then sees how far they are apart
-BLACK, SCALE, SHOT, FLOOR, LIMIT, POISSON, POISSON_FLOOR, BRIGHT = ROWS  # of a frame's coefficients
-TOP, SQUARES, TOTAL, SHOTS, FLOORS, LEVEL, CHI2, COUNT = ROWS  # of a chunk's working memory
+ROWS = range(0, 11 * WINDOW, WINDOW)  # beginnings in flat memory: the compiler then sees how far apart they are
+BLACK, SCALE, SHOT, FLOOR, LIMIT, POISSON, POISSON_FLOOR, BRIGHT, *UP_TO_HERE = ROWS  # of a frame's coefficients
+ALL_TOTAL, ALL_INVERSE, ALL_FLOORS = UP_TO_HERE  # Poisson weights of this and all shorter frames
+TOP, SQUARES, TOTAL, SHOTS, FLOORS, LEVEL, CHI2, COUNT = ROWS[:8]  # of a chunk's working memory
 NONE, SOME, ALL = range(3)  # of a chunk's samples clip
 BRIGHT_RATIO = 50.0  # shot over read noise, as variances: from here Poisson weights lose less than 0.1 %
 RATIO_ERROR = 0.005  # relative disagreement of frames that exposure error and flicker explain
@@ -48,8 +47,8 @@ def compiled(function: Callable[..., Any], *helpers: Callable[..., Any]) -> Call
 @functools.cache
 def block_kernel() -> Callable[..., None]:
     """`merge_block`, compiled."""
-    parts = (_pad, _clipping, _is_bright, _add, _anything_below, _add_careful, _sums, _level, _mean)
-    return compiled(merge_block, *parts, _disagreement, _raise_ghosts, _write, _bound)
+    sums = (_pad, _clipping, _unclipped_first, _plain, _add_one, _add_two, _sums, _add, _add_careful, _anything_below)
+    return compiled(merge_block, *sums, _is_bright, _level, _mean, _disagreement, _raise_ghosts, _write, _bound)
 
 
 def merge_block(
@@ -57,6 +56,7 @@ def merge_block(
     first: int,
     pitch: int,
     coefficients: np.ndarray,
+    bounds: np.ndarray,
     poisson: bool,
     chi2_limits: np.ndarray,
     radiance: np.ndarray,
@@ -81,8 +81,15 @@ def merge_block(
             _pad(samples[f, row], width, pitch)
         for start in range(0, width, CHUNK):
             end = start + WINDOW
+            target = slice(start, min(start + CHUNK, width))
             for f in range(frames):
-                state[f] = _clipping(samples[f, row, start:end], coefficient[f])
+                state[f] = _clipping(samples[f, row, start:end], bounds[f])
+            usual = _unclipped_first(state)
+            if usual > 0 and _plain(
+                samples, row, start + MARGIN, usual, coefficient, poisson, chi2_limits[min(2, frames)], work,
+                radiance[row, target], variance[row, target], mask[row, target],
+            ):  # fmt: skip
+                continue
             odd = _sums(samples, row, start, state, coefficient, True, work)
             optimal = not poisson and not _is_bright(state, coefficient, work)
             if optimal:
@@ -93,7 +100,6 @@ def merge_block(
                 for f in range(frames):
                     _disagreement(samples[f, row, start:end], coefficient[f], work)
                 _raise_ghosts(chi2_limits, work)
-            target = slice(start, min(start + CHUNK, width))
             if _write(work, radiance[row, target], variance[row, target], mask[row, target]):
                 for f in range(frames - 1, -1, -1):
                     _bound(samples[f, row, start:end], coefficient[f], radiance[row, target], mask[row, target])
@@ -111,25 +117,96 @@ def _pad(row: np.ndarray, width: int, pitch: int) -> None:
         steps = (MARGIN - 1 - x) // pitch + 1
         source = x + (2 * steps + 2) * pitch
         row[x] = row[source if source <= last else min(x + steps * pitch, last)]
-    for x in range(last + 1, len(row)):
+    for x in range(last + 1, last + 1 + MARGIN):
         steps = (x - last - 1) // pitch + 1
-        source = x - (2 * steps + 2) * pitch if steps <= 2 else x - 2 * pitch
+        source = x - (2 * steps + 2) * pitch
         row[x] = row[source if source >= MARGIN else max(x - steps * pitch, MARGIN)]
+    for x in range(last + 1 + MARGIN, len(row)):
+        row[x] = row[x - 6]  # whole cells; nobody asks for them, but they must look like the rest
 
 
-def _clipping(dn: np.ndarray, coefficient: np.ndarray) -> int:
+def _clipping(dn: np.ndarray, bounds: np.ndarray) -> int:
     """Whether none, some or all samples of a chunk clip, as far as their extremes tell; some, when one is no number."""
     least, most, strange = dn[0], dn[0], 0
     for x in range(WINDOW):
         least = dn[x] if dn[x] < least else least
         most = dn[x] if dn[x] > most else most
+    for x in range(WINDOW):
         strange |= 0 if dn[x] == dn[x] else 1
-    none, every = strange == 0, strange == 0
-    for phase in range(6):
-        black, scale, limit = coefficient[BLACK + phase], coefficient[SCALE + phase], coefficient[LIMIT + phase]
-        none &= (np.float32(most) - black) * scale < limit
-        every &= (np.float32(least) - black) * scale >= limit
-    return NONE if none else ALL if every else SOME
+    if strange > 0:
+        return SOME
+    return NONE if most < bounds[0] else ALL if least >= bounds[1] else SOME
+
+
+def _unclipped_first(state: np.ndarray) -> int:
+    """How many frames do not clip in a chunk, when all longer ones clip wholly; else none."""
+    count = 0
+    for f in range(len(state)):
+        if state[f] == SOME or (state[f] == NONE and count < f):
+            return 0
+        count = f + 1 if state[f] == NONE else count
+    return count
+
+
+def _plain(
+    samples: np.ndarray,
+    row: int,
+    start: int,
+    frames: int,
+    coefficient: np.ndarray,
+    poisson: bool,
+    chi2_limit: float,
+    work: np.ndarray,
+    radiance: np.ndarray,
+    variance: np.ndarray,
+    mask: np.ndarray,
+) -> bool:
+    """Merge and write a chunk of ``frames`` unclipped frames by Poisson weights; whether that is all there is to do.
+
+    It is not when read noise matters, frames disagree, or a longer frame, which clips, lies above the mean.
+    """
+    zero, odd, end = np.float32(0), 0, start + CHUNK
+    work[:CHUNK], work[SQUARES : SQUARES + CHUNK] = zero, zero
+    if frames % 2:
+        _add_one(samples[0, row, start:end], coefficient[0, MARGIN:], work)
+    for f in range(frames % 2, frames, 2):
+        one, two = samples[f, row, start:end], samples[f + 1, row, start:end]
+        _add_two(one, two, coefficient[f, MARGIN:], coefficient[f + 1, MARGIN:], work)
+    longest, brighter = coefficient[frames - 1, MARGIN:], coefficient[min(frames, len(coefficient) - 1), MARGIN:]
+    never = -np.float32(np.inf)
+    dim, below = never if poisson else zero, never if frames == len(coefficient) else zero
+    for x in range(len(radiance)):
+        top, inverse = work[TOP + x], longest[ALL_INVERSE + x]
+        mean = top * inverse
+        level = max(mean, zero)
+        spread = (level * longest[ALL_TOTAL + x] + longest[ALL_FLOORS + x]) * inverse * inverse
+        chi2 = work[SQUARES + x] - mean * top
+        floor = longest[FLOOR + x] * longest[POISSON + x]  # the least of the frames', as radiance
+        again = (chi2 > chi2_limit * (level + floor)) | (mean < longest[BRIGHT + x] + dim)
+        odd |= np.int32(again | (mean < brighter[LIMIT + x] + below))
+        radiance[x] = mean
+        variance[x] = spread
+        mask[x] = np.uint32(DARK) if mean * abs(mean) < spread else np.uint32(0)
+    return odd == 0
+
+
+def _add_one(dn: np.ndarray, coefficient: np.ndarray, work: np.ndarray) -> None:
+    """Add an unclipped frame to a chunk's sums of value and of squares by Poisson weights."""
+    for x in range(CHUNK):
+        value = (np.float32(dn[x]) - coefficient[BLACK + x]) * coefficient[SCALE + x]
+        weighted = coefficient[POISSON + x] * value
+        work[TOP + x] += weighted
+        work[SQUARES + x] += weighted * value
+
+
+def _add_two(dn: np.ndarray, dn_2: np.ndarray, one: np.ndarray, two: np.ndarray, work: np.ndarray) -> None:
+    """`_add_one` for two frames at once, which spares the memory of the sums."""
+    for x in range(CHUNK):
+        value = (np.float32(dn[x]) - one[BLACK + x]) * one[SCALE + x]
+        value_2 = (np.float32(dn_2[x]) - two[BLACK + x]) * two[SCALE + x]
+        weighted, weighted_2 = one[POISSON + x] * value, two[POISSON + x] * value_2
+        work[TOP + x] += weighted + weighted_2
+        work[SQUARES + x] += weighted * value + weighted_2 * value_2
 
 
 def _sums(

@@ -124,7 +124,7 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
     shape = ordered[0].mosaic.shape
     result = Merged(*(np.empty(shape, dtype) for dtype in (np.float32, np.float32, np.uint32)))
     pitch = 2 if len(shape) == 2 else shape[2]
-    coefficients = np.stack([[_coefficients(frame, phase) for frame in ordered] for phase in range(2)])
+    coefficients, bounds = _coefficients(ordered), np.array([_clip_bounds(frame) for frame in ordered])
     limits = _chi2_limits(len(ordered))
     dtype = np.uint16 if all(frame.mosaic.dtype in (np.uint8, np.uint16) for frame in ordered) else np.float32
     kernel, tiles = merge_kernel.block_kernel(), range(0, shape[0], TILE_ROWS)
@@ -138,7 +138,7 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
             ]
             for target, frame in zip(samples, ordered):
                 _load(frame.mosaic[rows], target[: rows.stop - start, MARGIN : MARGIN + out[0].shape[1]])
-            kernel(samples, start, pitch, coefficients, weights == "poisson", limits, *out)
+            kernel(samples, start, pitch, coefficients, bounds, weights == "poisson", limits, *out)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, (tiles[number::workers] for number in range(workers))))
@@ -160,23 +160,33 @@ def _load(rows: np.ndarray, target: np.ndarray) -> None:
         target[~np.isfinite(target)] = np.nan
 
 
-def _coefficients(frame: Exposed, phase: int) -> np.ndarray:
-    """(8 * WINDOW,) float32 of `merge_kernel.merge_block` for rows with ``row % 2 == phase``."""
-    g = frame.exposure
-    period = 2 if frame.mosaic.ndim == 2 else frame.mosaic.shape[2]
+def _coefficients(frames: Sequence[Exposed]) -> np.ndarray:
+    """(2, F, 11 * WINDOW) float32 of `merge_kernel.merge_block`, for even and for odd rows."""
+    rows = []
+    for frame in frames:
+        g, black, limit = frame.exposure, frame.black, frame.limit
+        shot, floor = np.maximum(frame.noise.shot, LEAST_SHOT), np.maximum(frame.noise.floor, LEAST_FLOOR)
+        bright = merge_kernel.BRIGHT_RATIO * floor / (shot * g)
+        cells = [black, 1 / ((frame.white - black) * g), shot / g, floor / g**2, limit / g, g / shot, floor / shot**2]
+        rows.append([_along_rows(cell, frame.mosaic.shape) for cell in (*cells, bright)])
+    each = np.array(rows)  # (F, 8, 2, WINDOW)
+    total, floors = np.cumsum(each[:, 5], 0), np.cumsum(each[:, 6], 0)
+    whole = np.concatenate([each, np.stack([total, 1 / total, floors], 1)], 1)
+    return np.ascontiguousarray(np.moveaxis(whole, 2, 0).reshape(2, len(frames), -1), np.float32)
+
+
+def _along_rows(cell: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(2, WINDOW): a (2, 2) or (1, 3) cell along an even and an odd row, from MARGIN samples before a cell on."""
+    period = 2 if len(shape) == 2 else shape[2]
     columns = (np.arange(merge_kernel.WINDOW) - MARGIN) % period
+    return np.broadcast_to(np.asarray(cell, float), (2, period))[:, columns]
 
-    def of_row(cell: np.ndarray) -> np.ndarray:
-        whole = np.broadcast_to(np.asarray(cell, float), (2, period))
-        return whole[phase][columns]
 
-    black, limit = of_row(frame.black), of_row(frame.limit)
-    shot, floor = (np.maximum(of_row(cell), least) for cell, least in (
-        (frame.noise.shot, LEAST_SHOT), (frame.noise.floor, LEAST_FLOOR)
-    ))  # fmt: skip
-    scale = 1 / ((frame.white - black) * g)
-    rows = [black, scale, shot / g, floor / g**2, limit / g, g / shot, floor / shot**2]
-    return np.concatenate([*rows, merge_kernel.BRIGHT_RATIO * floor / (shot * g)]).astype(np.float32)
+def _clip_bounds(frame: Exposed) -> tuple[float, float]:
+    """DN below which no sample of a frame clips, and from which on all do, a DN of rounding allowed for."""
+    level = frame.limit * (frame.white - frame.black) + frame.black
+    margin = 1e-6 * float(np.abs(level).max())
+    return float(level.min()) - margin, float(level.max()) + margin
 
 
 def _chi2_limits(frames: int) -> np.ndarray:
