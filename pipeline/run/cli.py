@@ -82,6 +82,9 @@ def build_parser() -> argparse.ArgumentParser:
     ball.add_argument("--exposures", help="seconds, as 1/20,1/60,..., where the files' metadata lack them")
     ball.add_argument("--distance-ratio", type=float, default=20.0, help="distance over radius of the ball (20)")
     ball.add_argument("--width", type=int, default=1024, help="of the map [px]; its height is half (1024)")
+    init = verb("init", closure.summary("stages.init"), capture=False)
+    init.add_argument("folder", type=Path, help="folder of photographs, searched with all folders below")
+    init.add_argument("-o", dest="out", type=Path, help="write it here (default: print it); never overwrites")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
@@ -143,6 +146,11 @@ def dispatch(args: argparse.Namespace) -> int:
         from stages.ball import ball
 
         ball(args.files, args.out, args.exposures, args.distance_ratio, args.width, say)
+        return 0
+    if args.verb == "init":
+        from stages.init import init
+
+        init(args.folder, args.out, say)
         return 0
     if args.verb == "doctor":
         from pipeline.run.doctor import examine
