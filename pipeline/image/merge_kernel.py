@@ -165,7 +165,7 @@ def _plain(
 
     It is not when read noise matters, frames disagree, or a longer frame, which clips, lies above the mean.
     """
-    zero, odd, end = np.float32(0), 0, start + CHUNK
+    zero, odd, end = np.float32(0), np.int32(0), start + CHUNK
     work[:CHUNK], work[SQUARES : SQUARES + CHUNK] = zero, zero
     if frames % 2:
         _add_one(samples[0, row, start:end], coefficient[0, MARGIN:], work)
@@ -187,7 +187,7 @@ def _plain(
         radiance[x] = mean
         variance[x] = spread
         mask[x] = np.uint32(DARK) if mean * abs(mean) < spread else np.uint32(0)
-    return odd == 0
+    return bool(odd == 0)
 
 
 def _add_one(dn: np.ndarray, coefficient: np.ndarray, work: np.ndarray) -> None:
