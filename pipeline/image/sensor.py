@@ -20,6 +20,10 @@ def restated(frame: Frame, stated: dict[str, Any]) -> Frame:
     ``bad_pixels`` (N, 2) adds to those that the file marks. Raises CaptureError when a fact does not fit the frame.
     """
     changes: dict[str, Any] = {key: stated[key] for key in ("white", "linear_limit") if key in stated}
+    if {"encoding", "space"} & stated.keys():
+        if frame.cfa:
+            raise CaptureError(f"{frame.file}: a mosaic, and [[sensor]] states encoding or space; take them out")
+        changes |= {key: stated[key] for key in ("encoding", "space") if key in stated}
     if "color_matrix" in stated:
         matrix = np.array(stated["color_matrix"], float)
         if abs(np.linalg.det(matrix)) < 1e-6:

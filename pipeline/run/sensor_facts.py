@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from pipeline.run.strict import Coordinate, Length, Share, Strict
@@ -23,6 +25,12 @@ class SensorFacts(Strict):
     )
     white: Length | None = Field(None, description="DN at which the sensor clips")
     linear_limit: Share | None = Field(None, gt=0.05, description="share of white - black up to which it is linear")
+    encoding: Literal["linear", "display"] | None = Field(
+        None, description="of a picture that is no RAW: proportional to light, or through a curve that is recovered"
+    )
+    space: Literal["linear_rec709", "linear_p3", "linear_rec2020", "linear_adobe_rgb", "acescg"] | None = Field(
+        None, description="primaries of a picture that is no RAW"
+    )
     bad_pixels: str | None = Field(
         None, description="text file, .gz or not: row column, or dcraw's column row time; relative to capture.toml"
     )

@@ -1,0 +1,155 @@
+"""Display-encoded brackets made linear, so that what follows treats them as it treats a sensor's samples.
+
+The curve of each camera is recovered from all of its views together (`pipeline.image.response`); codes become uint16
+samples proportional to light, whose noise the merge then measures between the frames as it does for RAW. What the curve
+does not know is no noise: it is the same in every pixel of one code, so it is added to the merged variance afterwards.
+
+A pixel of which one channel clips is not used for the others either, except in the shortest frame: the camera mixed its
+channels before it clipped the result, and hues drift there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.image.exposure import exposure_of
+from pipeline.image.response import CLIPPED_CODE, DARK_CODE, LINEAR_WHITE, TABLE, Response, recover
+from pipeline.types import Bracket, Frame, Raster, Result
+
+CURVE_PIXELS = 3_000_000  # of a frame, whole rows of JPEG transforms, from which its curve is recovered
+STRIP = 8  # rows
+LEVELS = 512  # radiances at which the curve's share of the variance is tabulated
+WEAK_SIGMA = 0.1  # relative uncertainty of a curve over its well exposed codes, from which on it is warned of
+WELL_EXPOSED = (20 / 255, 235 / 255)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """``brackets`` without display encodings; ``responses`` by camera; what to report."""
+
+    brackets: dict[str, Bracket]
+    responses: dict[str, Response]
+    tables: dict[str, np.ndarray]  # by file: (codes, 3) uint16
+    shortest: set[str]  # files that are the shortest of a view
+    numbers: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    evidence: list[dict[str, Any]] = field(default_factory=list)
+
+    def samples(self, frame: Frame, codes: np.ndarray) -> np.ndarray:
+        """(H, W, 3) uint16 linear samples of a display-encoded frame's codes; any other frame's as they are."""
+        table = self.tables.get(frame.file)
+        if table is None:
+            return codes
+        linear = np.stack([table[codes[..., c], c] for c in range(3)], -1)
+        if frame.file not in self.shortest:
+            linear[(linear == LINEAR_WHITE).any(-1)] = LINEAR_WHITE
+        return linear
+
+    def completed(self, merged: Result) -> Result:
+        """Merge's result with the curves' share of the variance, and what is to be said of them."""
+        if not self.responses:
+            return merged
+        listing = merged.outputs["exposures"]
+        mosaics = {view: self.widened(view, one, listing[view]) for view, one in merged.outputs["mosaics"].items()}
+        numbers = {**merged.numbers, "response": self.numbers}
+        said = [*self.warnings, *merged.warnings], [*merged.evidence, *self.evidence]
+        return Result({**merged.outputs, "mosaics": mosaics}, numbers, *said)
+
+    def widened(self, view: str, raster: Raster, rows: list[dict[str, Any]]) -> Raster:
+        """A merged view with the curve's uncertainty in its variance; ``rows``: its estimated exposures."""
+        frames = self.brackets[view].frames
+        if not frames or frames[0].file not in self.tables:
+            return raster
+        estimated = {row["file"]: row["estimated_s"] / row["label_s"] for row in rows}
+        exposures = np.array([exposure_of(frame) * estimated.get(frame.file, 1.0) for frame in frames])
+        rgb, variance = raster.rgb(), raster.rgb("variance")
+        response = self.responses[frames[0].camera]
+        for channel in range(3):
+            levels, relative = curve_variance(response, channel, exposures)
+            at = np.interp(np.log(np.maximum(rgb[..., channel], 1e-30)), levels, relative)
+            variance[..., channel] += (at * rgb[..., channel] ** 2).astype(np.float32)
+        return Raster({**raster.channels, **Raster.split(variance, "variance")}, raster.space, raster.attributes)
+
+
+def linearise(brackets: dict[str, Bracket], decode: Callable[[Frame], np.ndarray]) -> Linearised:
+    """Recover the curve of every camera with display-encoded frames; ``decode`` gives (H, W, 3) codes."""
+    views: dict[str, list[list[Frame]]] = {}
+    for name in sorted(brackets):
+        frames = [frame for frame in brackets[name].frames if frame.encoding == "display"]
+        if frames:
+            frames = sorted(frames, key=lambda frame: (exposure_of(frame), frame.file))
+            views.setdefault(frames[0].camera, []).append(frames)
+    result = Linearised(dict(brackets), {}, {}, {frames[0].file for group in views.values() for frames in group})
+    for camera, group in views.items():
+        codes = [[_strips(decode(frame)) * (1 / frame.white) for frame in frames] for frames in group]
+        response = recover(codes, [[exposure_of(frame) for frame in frames] for frames in group], 1.0)
+        result.responses[camera] = response
+        result.tables.update({frame.file: response.table(frame.white) for frames in group for frame in frames})
+        _report(result, camera, response, [frame for frames in group for frame in frames])
+    for name, bracket in brackets.items():
+        linear = [_as_linear(frame) if frame.file in result.tables else frame for frame in bracket.frames]
+        result.brackets[name] = bracket.model_copy(update={"frames": linear})
+    return result
+
+
+def _as_linear(frame: Frame) -> Frame:
+    return frame.model_copy(update={"encoding": "linear", "white": LINEAR_WHITE, "black": np.zeros((1, 3))})
+
+
+def _strips(codes: np.ndarray) -> np.ndarray:
+    """Whole strips of rows, evenly spaced, of at most CURVE_PIXELS in all; float32."""
+    step = max(1, -(-codes.shape[0] * codes.shape[1] // CURVE_PIXELS))
+    rows = np.arange(codes.shape[0] // STRIP * STRIP)
+    return codes[rows[(rows // STRIP) % step == 0]].astype(np.float32)
+
+
+def curve_variance(response: Response, channel: int, exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Relative variance that the curve's uncertainty leaves in a merged channel: ln radiance (N,), variance (N,).
+
+    The frames weigh by their exposure, as counts do; those in which the radiance clips or is dark do not, unless it
+    does in all. ``exposures``: of the view's frames, such that radiance times exposure is the share of LINEAR_WHITE.
+    """
+    grid = np.linspace(0, 1, TABLE)
+    light = response.log_light[:, channel]
+    top = max(float(np.interp(CLIPPED_CODE, grid, response.log_light[:, c])) for c in range(3))
+    low, high = np.interp((DARK_CODE, CLIPPED_CODE), grid, light) - top
+    levels = np.linspace(low - np.log(exposures.max()), high - np.log(exposures.min()), LEVELS)
+    logs = levels[:, None] + np.log(exposures)  # (N, F) ln of the share of white
+    weight = np.where((logs < high) & (logs > low), exposures, exposures * 1e-9)
+    weight /= weight.sum(1, keepdims=True)
+    codes = np.interp(logs + top, np.maximum.accumulate(light + 1e-9 * np.arange(TABLE)), grid)
+    rows = np.einsum("nf,nfk->nk", weight, response.basis[np.rint(codes * (TABLE - 1)).astype(int)])
+    return levels, np.einsum("nk,kl,nl->n", rows, response.covariance[channel], rows)
+
+
+def _report(result: Linearised, camera: str, response: Response, frames: list[Frame]) -> None:
+    grid = np.linspace(0, 1, TABLE)
+    well = (grid > WELL_EXPOSED[0]) & (grid < WELL_EXPOSED[1])
+    sigma = float(np.sqrt(np.mean(response.sigma()[well] ** 2)))
+    name = camera or frames[0].file
+    result.numbers[name] = {
+        "frames": len(frames),
+        "blocks": response.blocks,
+        "sigma_rel": sigma,
+        "noise_codes": response.misfit,
+        "codes_seen": (255 * response.support).round(1).tolist(),
+        "exposure_correction": {f.file: float(np.exp(o)) for f, o in zip(frames, response.offsets)},
+    }
+    known = response.blocks > 0
+    said = f"recovered to {sigma:.1%}" if known else f"not to be recovered (no two frames overlap): sRGB, {sigma:.0%}"
+    result.warnings.append(
+        f"{name}: {len(frames)} display-encoded photographs (no RAW), their curve {said}; RAW of the same bracket is "
+        "5 to 10 times more accurate (docs/capture.md)"
+    )
+    if known and sigma > WEAK_SIGMA:
+        result.warnings.append(f"{name}: the curve is known to {sigma:.0%} only; add frames about 1 EV apart")
+    result.evidence.append({
+        "term": f"response curve of {name}",
+        "modelled": known,
+        "because": f"{response.blocks} flat blocks seen in several frames, noise {response.misfit:.2f} codes",
+        "could_cost": f"{sigma:.1%} of radiance, in the variance; local tone mapping and saturation are not modelled",
+    })  # fmt: skip
