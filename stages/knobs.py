@@ -26,6 +26,9 @@ class Merge(Params):
 
     weights: Literal["poisson", "optimal"] = Field("optimal", description="per-sample weights")
     estimate_exposures: bool = Field(True, description="estimate exposure ratios instead of trusting labels")
+    noise: Literal["stated", "measured"] = Field(
+        "stated", description="[[noise]] or NoiseProfile, or what the frames show, where both are there"
+    )
 
 
 class Develop(Params):

@@ -1,10 +1,12 @@
-"""Merge RAW brackets to radiance before demosaicking, with variance and masks.
+"""Merge brackets to radiance before demosaicking, with variance and masks.
 
-Method: per CFA cell black and clip level; noise from DNG NoiseProfile, else measured between the frames (photon
-transfer), else assumed with a warning; exposures estimated from the frames with the labels as prior, a tripod view's
-against the plate's on what the ball leaves alone; inverse-variance weights (Poisson or with read noise), unbiased at
-clip and in the dark; chi-square flags what moved; defective photosites replaced.
-pipeline/image/{radiometry,exposure,tripod,noise}.py hold the equations and their sources.
+Method: black per CFA cell, measured on masked photosites where there are any; clip level and knee of every ISO from the
+frames; noise given, from DNG NoiseProfile, or measured between the frames (photon transfer), each with its uncertainty;
+exposures estimated from the frames with what the labels mean as prior, a tripod view's against the plate's on what the
+ball leaves alone; inverse-variance weights (Poisson or with read noise), unbiased at clip and in the dark; chi-square
+flags what moved; defective photosites replaced; the sensor's fixed pattern, which no average over frames removes, added
+to the variance. The equations and their sources: pipeline/image, from bracket_noise.py, bracket_exposure.py and
+radiometry.py on.
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
 Limits: frames of a view are not aligned; their shift is measured and reported. Views that neither stand where the
@@ -15,8 +17,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,20 +28,41 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
-from pipeline.image import exposure, noise, radiometry, tripod
-from pipeline.image.exposure import Ratio
-from pipeline.image.frames import read_samples
-from pipeline.image.noise import Noise
+from pipeline.image import (
+    bracket_exposure,
+    bracket_noise,
+    defects,
+    exposure,
+    fixed_pattern,
+    noise,
+    optical_black,
+    radiometry,
+)
+from pipeline.image.bracket_exposure import Exposures
+from pipeline.image.bracket_noise import Sample, Sensor
+from pipeline.image.cells import planes
+from pipeline.image.fixed_pattern import FixedPattern
+from pipeline.image.frames import is_encoded, read_samples
+from pipeline.image.linearise import linearise
+from pipeline.image.optical_black import OpticalBlack
 from pipeline.image.radiometry import Exposed, Merged
+from pipeline.image.raw import read_sensor
 from pipeline.run.artifacts import BRACKETS, EXPOSURES, FACTS, MOSAICS
 from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Frame, Raster, Result
 from stages import knobs
 
-SAMPLE_PIXELS = 2_000_000  # of a frame, for ratios and photon transfer
+HELD_BYTES = 2**30  # of decoded photographs kept between their statistics and their merge; the others are read again
 SHIFT_WARNING_PX = 0.5
-LABEL_WARNING = 0.1
-LIGHT_WARNING = 0.01  # static scene against shared settings
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Samples of a photograph, (H, W) or (H, W, 3) DN, its black measured on masked photosites, its listed defects."""
+
+    samples: np.ndarray
+    black: OpticalBlack | None = None
+    defects: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))  # (N, 2) row, column
 
 
 def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.Merge) -> Result:
@@ -47,56 +72,65 @@ def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.M
     still = {ball["name"] for ball in balls if ball.get("tripod")}
     own = {ball["name"]: json.dumps(ball["camera"], sort_keys=True) for ball in balls if ball.get("camera")}
     own |= {lens["name"]: "fisheye" for lens in facts.get("probe", {}).get("fisheye", [])}
-    return merge_brackets(brackets, lambda frame: read_samples(root / frame.file, frame), params, still, own)
+
+    linear = linearise(brackets, lambda frame: read_samples(root / frame.file, frame))
+
+    def decode(frame: Frame) -> Decoded:
+        if is_encoded(root / frame.file):
+            return Decoded(linear.samples(frame, read_samples(root / frame.file, frame)))
+        sensor = read_sensor(root / frame.file, frame)
+        listed = [sensor.defects] if frame.bad_pixels is None else [sensor.defects, frame.bad_pixels]
+        return Decoded(sensor.samples, sensor.black, np.concatenate(listed))
+
+    return linear.completed(merge_brackets(linear.brackets, decode, params, still, own, facts.get("noise", [])))
 
 
 def merge_brackets(
     brackets: dict[str, Bracket],
-    decode: Callable[[Frame], np.ndarray],
+    decode: Callable[[Frame], Decoded],
     params: knobs.Merge,
     still: Collection[str] = (),
     own: Mapping[str, str] = MappingProxyType({}),
+    given: Sequence[Mapping[str, Any]] = (),
 ) -> Result:
-    """The stage on mosaics wherever they come from: ``decode(frame)`` gives (H, W) DN.
+    """The stage on photographs wherever they come from. One view at a time is held in memory.
 
     ``still``: views taken from where the plate was taken. ``own``: views with another camera than the plate's, and what
-    tells it from others: one speed of two bodies is not one exposure.
+    tells it from others: one speed of two bodies is not one exposure. ``given``: tables of [[noise]].
     """
-    workers = os.cpu_count() or 1
     entries = [(view, frame) for view, bracket in sorted(brackets.items()) for frame in _ordered(bracket.frames)]
-    views, frames = [view for view, _ in entries], [frame for _, frame in entries]
-    with ThreadPoolExecutor(workers) as pool:
-        mosaics = list(pool.map(decode, frames))
-    warnings: list[str] = []
-    models, limits, noise_numbers = _noise_models(views, frames, mosaics, warnings)
-    ratios, across = [], []
+    views = [view for view, _ in entries]
+    photographs = _Photographs([frame for _, frame in entries], decode)
+    frames, samples, warnings = photographs.frames, photographs.samples, photographs.warnings
+    sensor = bracket_noise.sensor_of(views, samples, given, params.noise)
     if params.estimate_exposures:
-        ratios = _ratios(views, frames, mosaics, models, limits)
-        across = _ratios_across(views, frames, mosaics, models, limits, still)
-    offsets, sigmas = _exposures(views, frames, [*ratios, *across], own, params, warnings)
-    exposed = [
-        Exposed(
-            mosaic, exposure.exposure_of(frame) * float(np.exp(offset)), frame_black(frame), frame.white, limit, model
-        )
-        for frame, mosaic, offset, limit, model in zip(frames, mosaics, offsets, limits, models)
-    ]
-    rasters, numbers = {}, {}
+        exposures = bracket_exposure.estimate(views, samples, sensor.models, sensor.limits, still, own)
+    else:
+        exposures = bracket_exposure.by_labels(frames)
+    warnings += [*sensor.warnings, *exposures.warnings]
     profiles = colour_profiles(brackets, warnings)
+    merged: dict[str, Merged] = {}
+    numbers: dict[str, Any] = {}
+    listing: dict[str, list[dict[str, Any]]] = {}
+    shifts: dict[str, float] = {}
     for view in brackets:
-        members = [one for one, name in zip(exposed, views) if name == view]
-        merged, hot = radiometry.replace_defects(radiometry.merge(members, params.weights, workers))
-        rasters[view] = raster_of(merged, next(f for f, name in zip(frames, views) if name == view), profiles[view])
-        numbers[view] = _view_numbers(merged, hot, len(members))
+        members = [i for i, name in enumerate(views) if name == view]
+        exposed = [photographs.exposed(i, sensor, exposures) for i in members]
+        _note_shift(view, exposed, shifts)
+        listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
+        merged[view], hot = _merge_view(exposed, photographs.defects(members), params)
+        numbers[view] = _view_numbers(merged[view], hot, len(members))
         _warn_extremes(view, numbers[view], warnings)
-    listing = _exposure_rows(brackets, views, frames, exposed, offsets, sigmas)
-    shifts = _shifts(views, exposed)
-    evidence = _evidence(models, ratios, across, shifts, numbers, warnings)
-    totals = {
-        "noise": noise_numbers,
-        "ratios_measured": len(ratios),
-        "against_plate": _across_numbers(views, frames, across, offsets, warnings),
-        "shift_px": max(shifts.values(), default=0.0),
-    }
+        photographs.release(members)
+    patterns = _add_fixed_patterns(merged, views, frames, sensor)
+    for view, pattern in patterns.items():
+        numbers[view]["prnu"] = pattern.prnu if pattern.believed else 0.0
+        numbers[view]["prnu_sigma"] = pattern.prnu * pattern.sigma if pattern.believed else 0.0
+        numbers[view]["prnu_at_most"] = pattern.prnu * (1 + 3 * pattern.sigma * pattern.believed)
+    rasters = {view: raster_of(one, frames[views.index(view)], profiles[view]) for view, one in merged.items()}
+    totals = {"noise": sensor.numbers, **exposures.numbers, "optical_black": photographs.black_numbers}
+    totals |= {"shift_px": max(shifts.values(), default=0.0)}
+    evidence = _evidence(sensor, exposures, shifts, numbers, patterns, warnings)
     return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
 
 
@@ -104,193 +138,92 @@ def _ordered(frames: list[Frame]) -> list[Frame]:
     return sorted(frames, key=lambda frame: (exposure.exposure_of(frame), frame.file))
 
 
-def frame_black(frame: Frame) -> np.ndarray:
-    """(2, 2) black level in DN."""
-    return np.broadcast_to(frame.black, (2, 2)).astype(float)
+class _Photographs:
+    """The capture's photographs: statistics of all, samples of those that fit into HELD_BYTES, the others on demand.
 
+    ``frames`` carry the black that is subtracted: the measured one, where it differs from metadata.
+    """
 
-def _sample(mosaic: np.ndarray) -> np.ndarray:
-    """Whole CFA rows of a mosaic, few enough for statistics."""
-    step = max(1, round(mosaic.size / SAMPLE_PIXELS))
-    if step == 1:
-        return mosaic
-    rows = np.arange(mosaic.shape[0])
-    return mosaic[(rows // 2) % step == 0]
+    def __init__(self, frames: Sequence[Frame], decode: Callable[[Frame], Decoded]) -> None:
+        self._decode, self._stated = decode, list(frames)
+        self._held: dict[int, np.ndarray] = {}
+        self.frames, self.warnings = list(frames), list[str]()
+        self.samples: list[Sample] = []
+        self._defects: list[np.ndarray] = []
+        found: list[tuple[str, np.ndarray, OpticalBlack | None]] = []
+        size = max((frame.width * frame.height * (2 if frame.cfa else 6) for frame in frames), default=1)
+        workers = max(1, min(os.cpu_count() or 1, HELD_BYTES // max(size, 1)))
+        room = HELD_BYTES
+        with ThreadPoolExecutor(workers) as pool:
+            for start in range(0, len(frames), workers):  # in turns, so that no more than these are in memory
+                for i, one in enumerate(pool.map(decode, frames[start : start + workers]), start):
+                    found.append((frames[i].file, frames[i].black, one.black))
+                    if one.black is not None:
+                        black = optical_black.chosen(frames[i].black, one.black)
+                        self.frames[i] = frames[i].model_copy(update={"black": black})
+                    self.samples.append(bracket_noise.sample_of(one.samples, self.frames[i]))
+                    self._defects.append(one.defects)
+                    if one.samples.nbytes <= room:
+                        room -= one.samples.nbytes
+                        self._held[i] = one.samples
+        self.black_numbers, said = optical_black.report(found)
+        self.warnings += said
 
+    def exposed(self, index: int, sensor: Sensor, exposures: Exposures) -> Exposed:
+        """One frame, ready to merge."""
+        frame, held = self.frames[index], self._held.get(index)
+        samples = self._decode(self._stated[index]).samples if held is None else held
+        limit, model = sensor.limits[index], sensor.models[index]
+        return Exposed(samples, float(exposures.values[index]), frame.black, frame.white, limit, model)
 
-def _signal(frame: Frame, mosaic: np.ndarray) -> np.ndarray:
-    """(h, W) normalised signal of the sample."""
-    blank = Noise(np.zeros((2, 2)), np.zeros((2, 2)), "")
-    return Exposed(_sample(mosaic), 1.0, frame_black(frame), frame.white, np.ones((2, 2)), blank).signal()
+    def defects(self, members: Sequence[int]) -> np.ndarray:
+        """Rows and columns (N, 2) of the defects that any of these files lists."""
+        return np.unique(np.concatenate([self._defects[i] for i in members]).reshape(-1, 2), axis=0)
 
-
-def _neighbours(views: list[str], frames: list[Frame]) -> list[tuple[int, int]]:
-    """Index pairs (longer, shorter) of frames that follow each other in a view."""
-    return [(i + 1, i) for i in range(len(frames) - 1) if views[i] == views[i + 1]]
-
-
-def _noise_models(
-    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], warnings: list[str]
-) -> tuple[list[Noise], list[np.ndarray], dict[str, Any]]:
-    """Noise and linear limit of every frame; frames of one ISO and camera share what is measured."""
-    groups: dict[tuple[str, float, float], list[int]] = {}
-    for index, frame in enumerate(frames):
-        groups.setdefault((frame.camera, frame.iso, frame.white), []).append(index)
-    levels, measured = {}, {}
-    for key, members in groups.items():
-        black = frame_black(frames[members[0]])
-        step = 1 / (key[2] - float(black.mean()))
-        levels[key] = radiometry.clip_levels([mosaics[i] for i in members], key[2], black)
-        found = noise.from_profile(frames[members[0]]) or _transfer(views, frames, mosaics, members, levels[key], step)
-        if found is not None:
-            measured[key] = found
-    models: dict[int, Noise] = {}
-    limits: dict[int, np.ndarray] = {}
-    numbers: dict[str, Any] = {}
-    for key, members in groups.items():
-        _, iso, white = key
-        black, level = frame_black(frames[members[0]]), levels[key]
-        if np.any(level < white):
-            warnings.append(f"ISO {iso:g}: frames clip at {level.min():.0f} DN, not at {white:.0f} as metadata say")
-        model = measured.get(key) or _borrowed(key, measured, white - float(black.mean()), warnings)
+    def release(self, members: Sequence[int]) -> None:
+        """Forget the samples of these frames."""
         for i in members:
-            models[i] = noise.from_profile(frames[i]) or model
-            limits[i] = radiometry.linear_limits(level, black, white, models[i])
-        numbers[f"iso_{iso:g}"] = {
-            "source": model.source,
-            "electrons_at_white": float(1 / model.shot.mean()),
-            "read_noise_electrons": float(np.sqrt(model.floor.mean()) / model.shot.mean()),
-            "clip_dn": float(level.min()),
-        }
-    order = range(len(frames))
-    return [models[i] for i in order], [limits[i] for i in order], numbers
+            self._held.pop(i, None)
 
 
-def _borrowed(
-    key: tuple[str, float, float],
-    measured: dict[tuple[str, float, float], Noise],
-    full_scale_dn: float,
-    warnings: list[str],
-) -> Noise:
-    """Noise of an ISO that could not be measured: scaled from another ISO of the camera, else assumed."""
-    camera, iso, _ = key
-    others = sorted((other for other in measured if other[0] == camera), key=lambda other: abs(np.log(other[1] / iso)))
-    if others:
-        gain, source = iso / others[0][1], measured[others[0]]
-        warnings.append(
-            f"ISO {iso:g}: noise scaled from ISO {others[0][1]:g}, for want of NoiseProfile and frame pairs"
-        )
-        return Noise(source.shot * gain, source.floor * gain**2, f"scaled from ISO {others[0][1]:g}")
-    warnings.append(f"ISO {iso:g}: no NoiseProfile and too few frames to measure; a usual sensor is assumed")
-    return noise.assumed(iso, full_scale_dn)
+def _merge_view(exposed: Sequence[Exposed], listed: np.ndarray, params: knobs.Merge) -> tuple[Merged, int]:
+    """Merged frames of one view, and how many defects were replaced: those listed and, in a mosaic, what stands out.
+
+    Data without a mosaic are interpolated: a defect is no single sample there.
+    """
+    merged = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
+    count = defects.replace_listed(merged.radiance, merged.variance, merged.mask, listed)
+    if merged.radiance.ndim == 3:
+        return merged, count
+    replaced, found = radiometry.replace_defects(merged)
+    return replaced, found + count
 
 
-def _transfer(
-    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], members: list[int], level: np.ndarray, step: float
-) -> Noise | None:
-    """Photon transfer over all neighbouring frames of one ISO."""
-    bins = []
-    for long, short in _neighbours(views, frames):
-        if long in members and short in members:
-            black = frame_black(frames[long])
-            limit = float(((level - black) * step).min()) - 0.02
-            a, b = (_signal(frames[i], mosaics[i]).ravel() for i in (long, short))
-            label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
-            rough = (noise.assumed(frames[long].iso, 1 / step),) * 2
-            measured = exposure.measure_ratio(a, b, label, limit, rough)
-            if measured is not None:
-                bins += noise.transfer_bins(a, b, float(np.exp(measured[0])), limit, step)
-    return noise.from_transfer(bins, step)
+def _add_fixed_patterns(
+    merged: Mapping[str, Merged], views: Sequence[str], frames: Sequence[Frame], sensor: Sensor
+) -> dict[str, FixedPattern]:
+    """What is known of each view's fixed pattern (PRNU), given or measured; added to the variances, in place.
 
-
-def _ratios(
-    views: list[str], frames: list[Frame], mosaics: list[np.ndarray], models: list[Noise], limits: list[np.ndarray]
-) -> list[Ratio]:
-    """Measured exposure ratios of neighbouring frames."""
-    ratios = []
-    for long, short in _neighbours(views, frames):
-        a, b = (_signal(frames[i], mosaics[i]).ravel() for i in (long, short))
-        label = exposure.exposure_of(frames[short]) / exposure.exposure_of(frames[long])
-        limit = float(min(limits[long].min(), limits[short].min()))
-        found = exposure.measure_ratio(a, b, label, limit, (models[long], models[short]))
-        if found is not None:
-            ratios.append(Ratio(long, short, *found))
-    return ratios
-
-
-def _ratios_across(
-    views: list[str],
-    frames: list[Frame],
-    mosaics: list[np.ndarray],
-    models: list[Noise],
-    limits: list[np.ndarray],
-    still: Collection[str],
-) -> list[Ratio]:
-    """Exposure ratios of the plate's frames and the still views' frames."""
-    labels = [exposure.exposure_of(frame) for frame in frames]
-    members = {view: [i for i, name in enumerate(views) if name == view] for view in sorted({"plate", *still})}
-    plates = members.pop("plate")
-    wanted = [*plates, *(i for group in members.values() for i in group)] if any(members.values()) else []
-    blocks = {i: tripod.blocks_of(_signal(frames[i], mosaics[i]), float(limits[i].min()), models[i]) for i in wanted}
-    found = []
-    for group in members.values():
-        pairs = tripod.measure_views([(labels[i], blocks[i]) for i in plates], [(labels[i], blocks[i]) for i in group])
-        found += [Ratio(plates[p], group[b], one.log, one.sigma, one.blocks) for p, b, one in pairs]
-    return found
-
-
-def _across_numbers(
-    views: list[str], frames: list[Frame], across: list[Ratio], offsets: np.ndarray, warnings: list[str]
-) -> dict[str, dict[str, float]]:
-    """Pairs of each still view, and how the static scene's brightness differs from what the exposures explain."""
-    numbers: dict[str, dict[str, float]] = {}
-    for view in sorted({views[ratio.short] for ratio in across}):
-        pairs = [ratio for ratio in across if views[ratio.short] == view]
-        left = [
-            ratio.log
-            - np.log(exposure.exposure_of(frames[ratio.short]) / exposure.exposure_of(frames[ratio.long]))
-            - (offsets[ratio.short] - offsets[ratio.long])
-            for ratio in pairs
-        ]
-        numbers[view] = {"pairs": len(pairs), "light_change_rel": float(np.expm1(np.mean(left)))}
-        change = numbers[view]["light_change_rel"]
-        if abs(change) > LIGHT_WARNING:
-            warnings.append(
-                f"{view}: the scene is {abs(change):.1%} {'brighter' if change > 0 else 'darker'} than in the plate, "
-                "judged by the exposure settings that tie them; the light changed in between"
-            )
-    return numbers
-
-
-def _exposures(
-    views: list[str], frames: list[Frame], ratios: list[Ratio], own: Mapping[str, str], params: knobs.Merge,
-    warnings: list[str],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """ln(estimated / label) and its standard uncertainty, per frame; warns where labels are all there is."""
-    if not params.estimate_exposures:
-        return np.zeros(len(frames)), np.full(len(frames), exposure.LABEL_SIGMA)
-    speeds = [
-        (own.get(view, ""), frame.camera, frame.exposure_s, frame.iso, frame.fnumber)
-        for view, frame in zip(views, frames)
-    ]
-    labels = np.array([exposure.exposure_of(frame) for frame in frames])
-    offsets, sigmas = exposure.solve_exposures(labels, speeds, ratios)
-    measured = {(ratio.long, ratio.short) for ratio in ratios}
-    for long, short in _neighbours(views, frames):
-        if (long, short) not in measured:
-            warnings.append(
-                f"{frames[short].file}, {frames[long].file}: no pixels well exposed in both; their ratio is the labels'"
-            )
-    for i in np.flatnonzero(np.abs(offsets) > LABEL_WARNING):
-        warnings.append(f"{frames[i].file}: exposure is {np.exp(offsets[i]):.3f} times its label; the estimate is used")
-    groups = exposure.linked_views(views, speeds, ratios)
-    linked = set().union(*(group for group in groups if "plate" in group)) if "plate" in views else set(views)
-    for view in sorted(set(views) - linked):
-        warnings.append(
-            f"{view}: neither static scene nor exposure setting ties it to the plate; "
-            "its scale rests on labels (about 5 %)"
-        )
-    return offsets, sigmas
+    One camera has one pattern: views that show no flat part take the most certain of the camera's others.
+    """
+    found = {}
+    cameras = {view: frames[views.index(view)].camera for view in merged}
+    for view, one in merged.items():
+        model = sensor.models[views.index(view)]
+        if model.prnu > 0:
+            found[view] = FixedPattern(model.prnu, model.prnu_sigma, 0, True, "given")
+        elif (measured := fixed_pattern.measure(one.radiance, one.variance, one.mask)) is not None:
+            found[view] = measured
+    patterns = {}
+    for view, one in merged.items():
+        same = [pattern for other, pattern in found.items() if cameras[other] == cameras[view]]
+        believed = [found[view]] if view in found and found[view].believed else [one for one in same if one.believed]
+        options = believed or same
+        if options:
+            patterns[view] = min(options, key=lambda pattern: (pattern.sigma, pattern.prnu))
+        if believed:
+            noise.add_fixed_pattern(one.variance, one.radiance, patterns[view].prnu)
+    return patterns
 
 
 def colour_profiles(brackets: dict[str, Bracket], warnings: list[str]) -> dict[str, dict[str, Any]]:
@@ -308,12 +241,11 @@ def colour_profiles(brackets: dict[str, Bracket], warnings: list[str]) -> dict[s
             text = f"white balance differs between frames; that of {chosen.file} is used for all views"
             if text not in warnings:
                 warnings.append(text)
-    keys = ("camera", "color_matrix", "color_matrix_2", "illuminant", "illuminant_2", "as_shot_neutral")
-    keys += ("forward_matrix", "forward_matrix_2")
+    keys = {"camera", "color_matrix", "color_matrix_2", "illuminant", "illuminant_2", "as_shot_neutral"}
+    keys |= {"forward_matrix", "forward_matrix_2"}
     optics = {"lens", "focal_mm", "focal_35mm", "fnumber", "vignetting"}
     dumped = {
-        camera: {"file": frame.file, **{key: frame.model_dump(mode="json", include=set(keys))[key] for key in keys}}
-        for camera, frame in first.items()
+        camera: {"file": frame.file, **frame.model_dump(mode="json", include=keys)} for camera, frame in first.items()
     }
     return {
         view: {**dumped[one.frames[0].camera], "optics": one.frames[0].model_dump(mode="json", include=optics)}
@@ -322,9 +254,17 @@ def colour_profiles(brackets: dict[str, Bracket], warnings: list[str]) -> dict[s
 
 
 def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:
-    """The artifact of one view: Y, variance, mask; CFA and colour profile in the header."""
-    channels = {"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask}
-    return Raster(channels, CAMERA_RGB, {"insitu:cfa": frame.cfa, "insitu:colour": json.dumps(profile)})
+    """The artifact of one view: Y, variance, mask; CFA and colour profile in the header.
+
+    Data without a mosaic: R G B, variance.RGB, and one mask, whose bits are those of any channel.
+    """
+    header = {"insitu:cfa": frame.cfa, "insitu:colour": json.dumps(profile)}
+    if frame.cfa:
+        channels = {"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask}
+        return Raster(channels, CAMERA_RGB, header)
+    channels = Raster.split(merged.radiance) | Raster.split(merged.variance, "variance")
+    mask = np.bitwise_or.reduce(merged.mask, -1)
+    return Raster({**channels, "mask": mask}, frame.space or CAMERA_RGB, header)
 
 
 def _view_numbers(merged: Merged, hot: int, frames: int) -> dict[str, Any]:
@@ -364,56 +304,46 @@ def _warn_extremes(view: str, numbers: dict[str, Any], warnings: list[str]) -> N
         warnings.append(f"{view}: frames disagree in {numbers['ghost_fraction']:.1%} of the pixels; something moved")
 
 
-def _exposure_rows(
-    brackets: dict[str, Bracket],
-    views: list[str],
-    frames: list[Frame],
-    exposed: list[Exposed],
-    offsets: np.ndarray,
-    sigmas: np.ndarray,
-) -> dict[str, list[dict[str, Any]]]:
-    rows: dict[str, list[dict[str, Any]]] = {view: [] for view in brackets}
-    for view, frame, one, offset, sigma in zip(views, frames, exposed, offsets, sigmas):
-        limit = one.limit * (one.white - one.black) + one.black
-        clipped = [np.mean(one.mosaic[r::2, c::2] >= limit[r, c]) for r, c in np.ndindex(2, 2)]
-        rows[view].append(
-            {
-                "file": frame.file,
-                "label_s": frame.exposure_s,
-                "estimated_s": frame.exposure_s * float(np.exp(offset)),
-                "sigma_rel": float(sigma),
-                "iso": frame.iso,
-                "fnumber": frame.fnumber,
-                "clipped_fraction": float(np.mean(clipped)),
-            }
-        )
-    return rows
+def _exposure_row(frame: Frame, one: Exposed, exposures: Exposures, index: int) -> dict[str, Any]:
+    """What is written of one frame; ``nominal_s``: the time that its label means."""
+    limit = np.ravel(one.limit * (one.white - one.black) + one.black)
+    clipped = [np.mean(plane >= level) for plane, level in zip(planes(one.mosaic), limit)]
+    factor = float(exposures.values[index] / exposure.exposure_of(frame))
+    return {
+        "file": frame.file,
+        "label_s": frame.exposure_s,
+        "nominal_s": frame.exposure_s * float(exposures.meant[index] / exposure.exposure_of(frame)),
+        "estimated_s": frame.exposure_s * factor,
+        "sigma_rel": float(exposures.sigmas[index]),
+        "iso": frame.iso,
+        "fnumber": frame.fnumber,
+        "nd_stops": frame.nd_stops,
+        "clipped_fraction": float(np.mean(clipped)),
+    }
 
 
-def _shifts(views: list[str], exposed: list[Exposed]) -> dict[str, float]:
-    """Largest measured shift [px] between neighbouring frames of each view; views without structure are left out."""
-    shifts: dict[str, float] = {}
-    for index in range(len(exposed) - 1):
-        if views[index] == views[index + 1]:
-            shift = radiometry.measure_shift(exposed[index + 1], exposed[index])
-            if shift is not None:
-                shifts[views[index]] = max(shifts.get(views[index], 0.0), shift)
-    return shifts
+def _note_shift(view: str, exposed: Sequence[Exposed], shifts: dict[str, float]) -> None:
+    """Largest measured shift [px] between neighbouring frames of a view; views without structure are left out."""
+    for short, long in pairwise(exposed):
+        shift = radiometry.measure_shift(long, short)
+        if shift is not None:
+            shifts[view] = max(shifts.get(view, 0.0), shift)
 
 
 def _evidence(
-    models: list[Noise],
-    ratios: list[Ratio],
-    across: list[Ratio],
+    sensor: Sensor,
+    exposures: Exposures,
     shifts: dict[str, float],
     numbers: dict[str, Any],
+    patterns: Mapping[str, FixedPattern],
     warnings: list[str],
 ) -> list[dict[str, Any]]:
     moved = max(shifts.values(), default=0.0)
     if moved > SHIFT_WARNING_PX:
         warnings.append(f"frames of a view are shifted by up to {moved:.2f} px and are not aligned; use a tripod")
     ghosts = max((n["ghost_fraction"] for n in numbers.values()), default=0.0)
-    sources = sorted({model.source for model in models})
+    sources = sorted({model.source for model in sensor.models})
+    knees = sorted({one["linear_to"] for one in sensor.numbers.values() if "linear_to" in one})
     return [
         {
             "term": "noise model",
@@ -422,9 +352,19 @@ def _evidence(
             "could_cost": "weights and variances off; radiance stays unbiased",
         },
         {
+            "term": "knee below the clip level",
+            "modelled": bool(knees),
+            "because": f"longer frames depart from shorter ones beyond {', '.join(f'{knee:.0%}' for knee in knees)}"
+            if knees
+            else "no departure of 0.5 % where frames overlap",
+            "could_cost": "up to 0.5 % in the last tenths of a frame's range",
+        },
+        _pattern_evidence(patterns),
+        {
             "term": "exposure errors",
-            "modelled": bool(ratios or across),
-            "because": f"{len(ratios)} ratios measured between frames of a view, {len(across)} between plate and ball",
+            "modelled": bool(exposures.ratios or exposures.across),
+            "because": f"{len(exposures.ratios)} ratios measured between frames of a view, {len(exposures.across)} "
+            "between plate and ball",
             "could_cost": "up to 7 % between parts of the range that different frames cover",
         },
         {
@@ -442,6 +382,22 @@ def _evidence(
             "could_cost": "a mixture of states in flagged pixels",
         },
     ]
+
+
+def _pattern_evidence(patterns: Mapping[str, FixedPattern]) -> dict[str, Any]:
+    """The sensor's fixed pattern: what is known of it, and what not knowing it could cost."""
+    known = [pattern for pattern in patterns.values() if pattern.believed]
+    if known:
+        because = f"{known[0].prnu:.2%} +- {known[0].prnu * known[0].sigma:.2%}: {known[0].because}"
+        cost = "variance of bright parts"
+    elif patterns:
+        bound = min(patterns.values(), key=lambda pattern: pattern.prnu)
+        because = f"at most {bound.prnu:.2%}: {bound.because}"
+        cost = f"up to {bound.prnu:.2%} of each bright photosite beyond the stated variance; state prnu in [[noise]]"
+    else:
+        because = "no flat and bright part to measure it"
+        cost = "about 0.5 to 1 % of each bright photosite beyond the stated variance; state prnu in [[noise]]"
+    return {"term": "fixed pattern (PRNU)", "modelled": bool(known), "because": because, "could_cost": cost}
 
 
 STAGE = Stage(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.conventions import CLIPPED, DARK, GHOST, HOT
-from pipeline.image import exposure, noise, radiometry
+from pipeline.image import radiometry
 from pipeline.image.noise import Noise
 from pipeline.image.radiometry import Exposed, merge
 
@@ -231,87 +231,3 @@ def test_shift_between_frames():
     assert still < 0.05  # noise of 48 000 samples on gradients of 1 %/px
     assert moved == pytest.approx(1.0, abs=0.1)
     assert radiometry.measure_shift(photograph(np.zeros((64, 64)), 1, 1), photograph(np.zeros((64, 64)), 1, 2)) is None
-
-
-# noise and exposure
-
-
-def test_photon_transfer_recovers_the_sensor():
-    radiance = np.geomspace(1e-4, 5, 500 * 400).reshape(400, 500)
-    frames = bracket(radiance, seed=3, stops=[0.05, 0.2, 0.8])
-    bins = []
-    for short, long in ((0, 1), (1, 2)):
-        signals = [frames[i].signal().ravel() for i in (long, short)]
-        bins += noise.transfer_bins(*signals, 0.25, 0.97, STEP)
-    found = noise.from_transfer(bins, STEP)
-    assert found is not None
-    assert 1 / found.shot[0, 0] == pytest.approx(ELECTRONS, rel=0.03)  # some 20 bins of 3 % each
-    assert np.sqrt(found.floor[0, 0]) == pytest.approx(np.sqrt(MODEL.floor[0, 0]), rel=0.05)
-
-
-def test_photon_transfer_declines_a_flat_dark_frame():
-    frames = bracket(np.zeros((200, 200)), stops=[0.25, 1.0])
-    bins = noise.transfer_bins(frames[1].signal().ravel(), frames[0].signal().ravel(), 0.25, 0.97, STEP)
-    assert noise.from_transfer(bins, STEP) is None
-
-
-@pytest.mark.parametrize("error", [0.0, 0.07, -0.4])
-def test_exposure_ratio_to_a_third_of_a_percent(error):
-    """True ratio is off its label by ``error``; a corner of the scene moves."""
-    random = np.random.default_rng(5)
-    radiance = np.exp(random.normal(-3, 1.5, (300, 300)))
-    moved = radiance.copy()
-    moved[:40, :60] *= 1.5
-    ratio = 0.25 * (1 + error)
-    long, short = photograph(radiance, 1.0, 8), photograph(moved, ratio, 9)
-    found = exposure.measure_ratio(long.signal().ravel(), short.signal().ravel(), 0.25, 0.99, (MODEL, MODEL))
-    assert found is not None
-    log, sigma, _ = found
-    assert abs(np.exp(log) / ratio - 1) < 0.003
-    assert sigma < 0.003
-
-
-def test_exposure_ratio_in_the_dark_is_unbiased():
-    # Many dark pixels: a choice on the long frame alone would be 2 % off.
-    radiance = np.random.default_rng(6).exponential(0.004, (500, 500))
-    pulls = []
-    for seed in range(8):
-        long, short = photograph(radiance, 1.0, 2 * seed), photograph(radiance, 0.25, 2 * seed + 1)
-        log, sigma, _ = exposure.measure_ratio(
-            long.signal().ravel(), short.signal().ravel(), 0.25, 0.99, (MODEL, MODEL)
-        )
-        pulls.append((log - np.log(0.25)) / sigma)
-    assert abs(np.mean(pulls)) < 4 / np.sqrt(8)
-
-
-def test_no_overlap_is_no_ratio():
-    dark, bright = np.full(1000, 1e-5, np.float32), np.full(1000, 1.0, np.float32)
-    assert exposure.measure_ratio(bright, dark, 1e-5, 0.99, (MODEL, MODEL)) is None
-
-
-def test_joint_solution_recovers_true_exposures():
-    """Plate and ball share two speeds; every speed is off by up to 7 %, one by 40 %."""
-    labels = np.array([1 / 60, 1 / 15, 1 / 4, 1 / 500, 1 / 125, 1 / 60, 1 / 15])
-    true = {1 / 500: 1.03, 1 / 125: 0.6, 1 / 60: 0.95, 1 / 15: 1.04, 1 / 4: 0.99}
-    actual = np.array([label * true[label] for label in labels])
-    speeds = [(label, 100.0, 8.0) for label in labels]
-    ratios = [exposure.Ratio(i + 1, i, float(np.log(actual[i] / actual[i + 1])), 5e-4, 1000) for i in (0, 1, 3, 4, 5)]
-    offsets, sigmas = exposure.solve_exposures(labels, speeds, ratios)
-    found = labels * np.exp(offsets)
-    np.testing.assert_allclose(found / found[0], actual / actual[0], rtol=0.003)
-    assert abs(np.exp(offsets) / [true[label] for label in labels] - 1).max() < 0.05  # the common factor, by the prior
-    assert np.all(sigmas < 0.01)
-    assert found[0] == pytest.approx(found[5], rel=1e-3)  # one speed, one time
-
-
-def test_without_measurements_labels_stand():
-    offsets, sigmas = exposure.solve_exposures(np.array([0.1, 0.4]), [(0.1, 100, 8), (0.4, 100, 8)], [])
-    np.testing.assert_allclose(offsets, 0, atol=1e-12)
-    assert np.all(sigmas > 0.02)
-
-
-def test_linked_views():
-    speeds = [(0.1, 100.0, 8.0), (0.4, 100.0, 8.0), (0.1, 100.0, 8.0), (0.01, 100.0, 8.0)]
-    groups = exposure.linked_views(["plate", "plate", "a", "b"], speeds, [exposure.Ratio(1, 0, -1.4, 1e-3, 100)])
-    assert {"plate", "a"} in groups
-    assert {"b"} in groups

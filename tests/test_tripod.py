@@ -88,7 +88,7 @@ def run(ball: np.ndarray, still: tuple[str, ...], turn: bool = False):
             name: bracket.model_copy(update={"frames": bracket.frames[::-1]})
             for name, bracket in reversed(brackets.items())
         }
-    result = merge.merge_brackets(brackets, lambda frame: files[frame.file], knobs.Merge(), still)
+    result = merge.merge_brackets(brackets, lambda frame: merge.Decoded(files[frame.file]), knobs.Merge(), still)
     errors = {}
     for name, _, exposures in wanted:
         rows = result.outputs["exposures"][name]
@@ -160,7 +160,7 @@ def test_light_that_changed_everywhere_is_told_from_shared_settings():
         "plate": bracket_of("plate", desk(), PLATE, files),
         "ball_a": bracket_of("ball_a", 1.1 * with_ball(desk()), PLATE, files),
     }
-    result = merge.merge_brackets(brackets, lambda frame: files[frame.file], knobs.Merge(), ("ball_a",))
+    result = merge.merge_brackets(brackets, lambda frame: merge.Decoded(files[frame.file]), knobs.Merge(), ("ball_a",))
     assert any("ball_a" in text and "the light changed in between" in text for text in result.warnings)
 
 

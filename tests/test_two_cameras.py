@@ -79,7 +79,7 @@ def folder(tmp_path: Path) -> Path:
     """Two bodies: other matrix, other size, faster, its white balance set to tungsten; one setting in both."""
     (tmp_path / "capture.toml").write_text(MANIFEST)
     seen = OTHER_MATRIX @ D65 / (OTHER_MATRIX @ D65)[1]
-    for number, label in enumerate((1 / 100, 1 / 25)):
+    for number, label in enumerate((1 / 128, 1 / 32)):  # what such labels mean
         write_frame(tmp_path / f"plate/{number}.dng", scene(*SIZES["plate"], CARDS["plate"]), label, label, number)
         acescg = as_seen_by(OTHER_MATRIX, seen, scene(*SIZES["ball"], CARDS["ball"]))
         write_frame(

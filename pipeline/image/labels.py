@@ -20,6 +20,9 @@ from pipeline.types import Frame
 Ladder = Literal["thirds", "halves", "stated"]
 LADDERS: tuple[Ladder, ...] = ("thirds", "halves", "stated")
 SAME_NAME = 0.01  # relative; names are at least 4 % apart
+SAME_NUMBER = 0.002
+STEP_SIGMA = 0.01  # relative, of a ratio of two shutter times
+DECISIVE = 20.0
 
 _WHOLE = "30 15 8 4 2 1 1/2 1/4 1/8 1/15 1/30 1/60 1/125 1/250 1/500 1/1000 1/2000 1/4000 1/8000 1/16000 1/32000"
 _TIMES = {
@@ -48,7 +51,7 @@ _STOP_NAMES = {ladder: _values(f"{_WHOLE_STOPS} {names}") for ladder, names in _
 def _meaning(value: float, names: np.ndarray, steps: int) -> float | None:
     """``2^(k / steps)`` that a name, or the number itself, stands for; None when it is neither."""
     meant = 2.0 ** (np.round(steps * np.log2(value)) / steps)
-    known = np.any(np.abs(names / value - 1) < SAME_NAME) or abs(meant / value - 1) < SAME_NAME
+    known = np.any(np.abs(names / value - 1) < SAME_NAME) or abs(meant / value - 1) < SAME_NUMBER
     return float(meant) if known else None
 
 
@@ -72,19 +75,20 @@ def exposure_meant(frame: Frame, ladder: Ladder) -> float:
 def choose_ladder(frames: Sequence[Frame], measured: Sequence[tuple[int, int, float]]) -> tuple[Ladder, str]:
     """The ladder that the labels of one camera are on, and why.
 
-    ``measured``: (long, short, ln of the exposure ratio short over long) with indices into ``frames``. The meaning that
-    fits the ratios best wins, judged by a heavy-tailed score, because single speeds of a shutter may be off; without
-    ratios that tell, the ladder that knows most of the labels, thirds first.
+    ``measured``: (long, short, ln of the exposure ratio short over long) with indices into ``frames``. A ladder must
+    know every shutter time; thirds come first, the labels at their word last, unless measured ratios fit a later one
+    by a likelihood of `DECISIVE` better. The likelihood is heavy-tailed: single speeds of a shutter may be off.
     """
-    known = {ladder: sum(time_meant(frame.exposure_s, ladder) is not None for frame in frames) for ladder in LADDERS}
-    known["stated"] = 0  # everything is
-    logs = {ladder: np.log([exposure_meant(frame, ladder) for frame in frames]) for ladder in LADDERS}
-    scores = dict.fromkeys(LADDERS, 0.0)
-    for ladder in LADDERS:
-        for long, short, log in measured:
-            miss = (log - (logs[ladder][short] - logs[ladder][long])) / 0.01
-            scores[ladder] += float(np.log1p(miss**2))
-    best = min(LADDERS, key=lambda ladder: (round(scores[ladder]), -known[ladder]))
-    if measured and max(scores.values()) - scores[best] > 1:
+    times = {frame.exposure_s for frame in frames}
+    possible = [ladder for ladder in LADDERS if all(time_meant(seconds, ladder) is not None for seconds in times)]
+    scores = {}
+    for ladder in possible:
+        logs = np.log([exposure_meant(frame, ladder) for frame in frames])
+        misses = np.array([log - (logs[short] - logs[long]) for long, short, log in measured])
+        scores[ladder] = float(np.sum(np.log1p((misses / STEP_SIGMA) ** 2)))
+    best = min(possible, key=lambda ladder: scores[ladder])
+    if scores[possible[0]] - scores[best] > np.log(DECISIVE):
         return best, f"{len(measured)} measured ratios fit it best"
-    return best, f"{known[best]} of {len(frames)} labels are its names"
+    if possible[0] == "stated":
+        return "stated", "the times are no names of thirds or halves of a stop"
+    return possible[0], f"all {len(times)} times are its names"

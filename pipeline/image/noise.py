@@ -1,16 +1,22 @@
 """Noise of sensor samples: variance = shot * signal + floor, on the signal x = (DN - black) / (white - black).
 
 ``shot`` is 1 / (electrons at white); ``floor`` holds read noise and quantisation. The form is that of DNG NoiseProfile
-(DNG 1.7.1), and the photon-transfer measurement that of Janesick 2007: the variance of the difference of two frames of
-one scene, brought to one exposure, against their signal.
+(DNG 1.7.1); pipeline/image/photon_transfer.py measures it. Both numbers, and the photo-response non-uniformity (PRNU),
+carry their own relative standard uncertainty.
 
-Limits: fixed-pattern gain (PRNU) is the same in every frame of a view and is not noise here; the gain is one number for
-the three colours when it is measured.
+PRNU is a gain of each photosite, the same in every frame of a camera: averaging over frames leaves it, so it is added
+to the variance of the merged radiance (`add_fixed_pattern`) and stays out of the weights and of the comparison of
+frames, where it cancels.
+
+Between ISO settings ``shot`` goes with the ISO. Read noise before the amplifier goes with its square, behind it (the
+converter) not at all: two known settings tell them apart, one does not.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,31 +24,55 @@ from pipeline.types import Frame
 
 ASSUMED_ELECTRONS = 30000.0  # at white, ISO 100: between a phone's 5 000 and a full frame's 80 000
 ASSUMED_READ_ELECTRONS = 3.0
-MIN_BIN = 200  # samples in a photon-transfer bin: its variance is then known to 10 %
-MAX_SAMPLES = 200_000  # of one pair of frames
+ASSUMED_SIGMA = 0.7  # relative, of both: a factor of two either way
+PROFILE_SIGMA = (0.05, 0.1)  # relative, of shot and floor: a profile is of a model at an ISO, not of this body
+ISO_SIGMA = 0.03  # relative, of the ratio of two ISO labels
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of one frame: ``shot`` and ``floor`` (2, 2) in CFA cell order, of normalised signal, and their source."""
+    """Noise of one frame: ``shot`` and ``floor`` per CFA cell (2, 2) or channel (1, 3), of normalised signal.
+
+    ``prnu``: relative standard deviation of the photosites' gain. Sigmas are relative standard uncertainties.
+    """
 
     shot: np.ndarray
     floor: np.ndarray
     source: str
+    shot_sigma: float = 0.0
+    floor_sigma: float = 0.0
+    prnu: float = 0.0
+    prnu_sigma: float = 0.0
 
     def variance(self, signal: float) -> np.ndarray:
-        """(2, 2) variance of a sample of this signal."""
+        """Per cell or channel, variance of a sample of this signal; the fixed pattern apart."""
         return self.shot * max(signal, 0.0) + self.floor
 
+    def numbers(self) -> dict[str, Any]:
+        """Electrons at white, read noise in electrons and PRNU, each with its standard uncertainty, for the record."""
+        electrons = float(1 / self.shot.mean())
+        read = float(np.sqrt(self.floor.mean()) / self.shot.mean())
+        found: dict[str, Any] = {
+            "source": self.source,
+            "electrons_at_white": electrons,
+            "electrons_at_white_sigma": electrons * self.shot_sigma,
+            "read_noise_electrons": read,
+            "read_noise_electrons_sigma": read * float(np.hypot(self.floor_sigma / 2, self.shot_sigma)),
+            "prnu": self.prnu,
+            "prnu_sigma": self.prnu * self.prnu_sigma,
+        }
+        if np.ptp(self.shot) > 0:
+            found["electrons_at_white_by_cell"] = (1 / self.shot.ravel()).tolist()
+        return found
 
-@dataclass(frozen=True, eq=False)
-class Bin:
-    """One photon-transfer measurement: ``variance = shot * signal_term + floor * floor_term``."""
 
-    signal_term: float
-    floor_term: float
-    variance: float
-    count: int
+def full_scale(frame: Frame) -> float:
+    """White less the mean black level, DN."""
+    return frame.white - float(np.mean(frame.black))
+
+
+def _uniform(frame: Frame, shot: float, floor: float, source: str, **more: float) -> Noise:
+    return Noise(np.full(frame.black.shape, shot), np.full(frame.black.shape, floor), source, **more)
 
 
 def from_profile(frame: Frame) -> Noise | None:
@@ -51,65 +81,72 @@ def from_profile(frame: Frame) -> Noise | None:
     if profile is None or not np.all(np.isfinite(profile)) or profile[0] <= 0 or np.any(profile < 0):
         return None
     pairs = profile.reshape(-1, 2)
-    planes = np.array([0 if len(pairs) == 1 else "RGB".index(colour) for colour in frame.cfa]).reshape(2, 2)
-    quantisation = 1 / (12 * (frame.white - float(np.mean(frame.black))) ** 2)
-    return Noise(pairs[planes, 0], np.maximum(pairs[planes, 1], quantisation), "NoiseProfile")
+    colours = frame.cfa or "RGB"
+    cells = np.array([0 if len(pairs) == 1 else "RGB".index(colour) for colour in colours]).reshape(frame.black.shape)
+    quantisation = 1 / (12 * full_scale(frame) ** 2)
+    return Noise(pairs[cells, 0], np.maximum(pairs[cells, 1], quantisation), "NoiseProfile", *PROFILE_SIGMA)
 
 
-def assumed(iso: float, white_minus_black: float) -> Noise:
-    """A usual sensor at this ISO, for want of anything better."""
-    shot = iso / 100 / ASSUMED_ELECTRONS
-    floor = (ASSUMED_READ_ELECTRONS * shot) ** 2 + 1 / (12 * white_minus_black**2)
-    return Noise(np.full((2, 2), shot), np.full((2, 2), floor), "assumed")
+def from_facts(frame: Frame, tables: Sequence[Mapping[str, Any]]) -> Noise | None:
+    """What [[noise]] of capture.toml says of a frame's ISO; None when it says nothing of it."""
+    for table in tables:
+        if table["iso"] == frame.iso and table["camera"] in ("", frame.camera):
+            scale = full_scale(frame)
+            electrons = table["electrons_at_white"] or table["electrons_per_dn"] * scale
+            read = (table["read_noise_electrons"] / electrons) ** 2
+            floor = read + 1 / (12 * scale**2)
+            sigmas = {"shot_sigma": table["gain_sigma_rel"], "floor_sigma": 2 * table["read_noise_sigma_rel"]}
+            pattern = {"prnu": table["prnu"] or 0.0, "prnu_sigma": table["prnu_sigma_rel"] if table["prnu"] else 0.0}
+            return _uniform(frame, 1 / electrons, floor, "given", **sigmas, **pattern)
+    return None
 
 
-def transfer_bins(long: np.ndarray, short: np.ndarray, ratio: float, limit: float, step: float) -> list[Bin]:
-    """Photon-transfer bins of two frames of one scene and one ISO.
+def assumed(frame: Frame) -> Noise:
+    """A usual sensor at a frame's ISO, for want of anything better."""
+    shot = frame.iso / 100 / ASSUMED_ELECTRONS
+    floor = (ASSUMED_READ_ELECTRONS * shot) ** 2 + 1 / (12 * full_scale(frame) ** 2)
+    return _uniform(frame, shot, floor, "assumed", shot_sigma=ASSUMED_SIGMA, floor_sigma=2 * ASSUMED_SIGMA)
 
-    ``long``, ``short``: normalised signals (N,); ``ratio``: exposure of short over long, at most 1; samples at or above
-    ``limit`` are left out; ``step`` is one DN. The variance of ``short - ratio * long`` is
-    ``shot * ratio * long * (1 + ratio) + floor * (1 + ratio^2)``; its mean in a bin (exposure error) is taken off.
+
+def scaled(iso: float, known: Mapping[float, Noise]) -> Noise:
+    """Noise at an ISO from that of other settings of the same camera.
+
+    With two or more, the floor's parts before and behind the amplifier are solved for (not negative). With one it goes
+    with the square upward, which is its upper bound, and with the first power downward, halfway between its bounds;
+    the floor's uncertainty is that of the choice.
     """
-    usable = np.flatnonzero((long < limit) & (short < limit) & (long > -0.1))
-    usable = usable[:: max(1, len(usable) // MAX_SAMPLES)]
-    long, short = long[usable], short[usable]
-    edges = np.concatenate([[-0.1], np.geomspace(2e-4, 1.0, 25)])
-    which = np.digitize(long, edges)
-    bins = []
-    for number in np.flatnonzero(np.bincount(which, minlength=len(edges)) >= MIN_BIN):
-        members = which == number
-        expected = ratio * long[members]
-        difference = short[members] - expected
-        difference -= np.median(difference)
-        # motion, hot pixels and edges are outliers; one DN keeps quantised data from being cut to nothing
-        cut = 4 * max(1.4826 * float(np.median(np.abs(difference))), step)
-        kept = np.abs(difference) < cut
-        count = int(kept.sum())
-        if count >= MIN_BIN:
-            variance = float(np.var(difference[kept], dtype=np.float64))
-            signal = max(float(expected[kept].mean(dtype=np.float64)), 0.0)
-            bins.append(Bin(signal * (1 + ratio), 1 + ratio**2, variance, count))
-    return bins
+    nearest = min(known, key=lambda other: (abs(np.log(other / iso)), other))
+    source, gain = known[nearest], iso / nearest
+    others = " and ".join(f"{other:g}" for other in sorted(known)[:2]) if len(known) > 1 else f"{nearest:g}"
+    text = f"scaled from ISO {others}"
+    shot_sigma = float(np.hypot(source.shot_sigma, ISO_SIGMA))
+    if len(known) > 1:
+        from scipy.optimize import nnls
+
+        isos = np.array(sorted(known))
+        floors = np.array([known[other].floor.mean() for other in isos])
+        terms = np.stack([(isos / iso) ** 2, np.ones(len(isos))], 1)
+        before, behind = nnls(terms / floors[:, None], np.ones(len(isos)))[0]
+        floor = source.floor * (before + behind) / source.floor.mean()
+        return replace(source, shot=source.shot * gain, floor=floor, source=text, shot_sigma=shot_sigma)
+    floor = source.floor * (gain**2 if gain > 1 else gain)
+    sigma = float(np.hypot(source.floor_sigma, abs(np.log(gain))))
+    return replace(source, shot=source.shot * gain, floor=floor, source=text, shot_sigma=shot_sigma, floor_sigma=sigma)
 
 
-def from_transfer(bins: list[Bin], step: float) -> Noise | None:
-    """Shot and floor by weighted least squares over bins; None when the bins do not tell them apart.
+def disagreement(stated: Noise, measured: Noise) -> dict[str, float]:
+    """Relative difference of stated from measured shot and floor, and how many standard uncertainties each is."""
+    found = {}
+    for name in ("shot", "floor"):
+        one, other = (float(getattr(noise, name).mean()) for noise in (stated, measured))
+        sigmas = [getattr(noise, f"{name}_sigma") for noise in (stated, measured)]
+        found[f"{name}_rel"] = one / other - 1
+        found[f"{name}_sigmas"] = abs(one / other - 1) / max(float(np.hypot(*sigmas)), 1e-12)
+    return found
 
-    ``step`` is one DN; the floor is at least its quantisation noise, step^2 / 12.
-    """
-    if len(bins) < 3:
-        return None
-    terms = np.array([[b.signal_term, b.floor_term] for b in bins])
-    variance = np.array([b.variance for b in bins])
-    least = step**2 / 12
-    # relative error of a variance from n samples, and 3 % of model error so that one huge bin does not rule
-    weight = 1 / np.maximum(variance, least) / np.sqrt([2 / b.count + 0.03**2 for b in bins])
-    scaled, target = terms * weight[:, None], variance * weight
-    shot, floor = np.linalg.lstsq(scaled, target, rcond=None)[0]
-    if floor < least:
-        floor = least
-        shot = float(scaled[:, 0] @ (target - floor * scaled[:, 1]) / (scaled[:, 0] @ scaled[:, 0]))
-    information = scaled.T @ scaled
-    if np.linalg.det(information) <= 0 or shot < 4 * float(np.sqrt(np.linalg.inv(information)[0, 0])):
-        return None  # too little range of signal
-    return Noise(np.full((2, 2), shot), np.full((2, 2), floor), "photon transfer")
+
+def add_fixed_pattern(variance: np.ndarray, radiance: np.ndarray, prnu: float) -> None:
+    """Add ``(prnu * radiance)^2`` to the variance of a merged radiance, in place, both (H, W) or (H, W, 3) float32."""
+    for start in range(0, len(radiance) if prnu > 0 else 0, 256):
+        rows = slice(start, start + 256)
+        variance[rows] += np.square(np.float32(prnu) * radiance[rows])

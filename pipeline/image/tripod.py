@@ -48,14 +48,27 @@ class Agreement:
     share: float
 
 
-def blocks_of(signal: np.ndarray, limit: float, noise: Noise) -> Blocks:
-    """Blocks of whole CFA cells of a normalised signal (H, W); what is left at the right and lower edge is cut."""
-    side = max(2, 2 * round(np.sqrt(signal.size / BLOCKS) / 2))
+def block_means(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Mean (h, w) float64 and largest sample of blocks of whole CFA cells of (H, W) or (H, W, 3) data, and their side.
+
+    What is left at the right and lower edge is cut. Works on DN as on normalised signal.
+    """
+    side = max(2, 2 * round(np.sqrt(signal.shape[0] * signal.shape[1] / BLOCKS) / 2))
     height, width = signal.shape[0] // side, signal.shape[1] // side
-    parts = signal[: height * side, : width * side].reshape(height, side, width, side)
-    mean = parts.mean((1, 3), dtype=np.float64)
+    parts = signal[: height * side, : width * side].reshape(height, side, width, side, signal[:1, :1].size)
+    return parts.mean((1, 3, 4), dtype=np.float64), parts.max((1, 3, 4)), side
+
+
+def blocks_of(signal: np.ndarray, limit: float, noise: Noise) -> Blocks:
+    """Blocks of a normalised signal (H, W) or (H, W, 3)."""
+    mean, top, side = block_means(signal)
+    return blocks_from(mean, top, side, limit, noise)
+
+
+def blocks_from(mean: np.ndarray, top: np.ndarray, side: int, limit: float, noise: Noise) -> Blocks:
+    """Blocks of what `block_means` found in a normalised signal."""
     variance = (noise.shot.mean() * np.maximum(mean, 0) + noise.floor.mean()) / side**2
-    return Blocks(mean, variance, parts.max((1, 3)) < 0.95 * limit)  # a NaN compares false
+    return Blocks(mean, variance, top < 0.95 * limit)  # a NaN compares false
 
 
 def usable_blocks(plate: Blocks, ball: Blocks, label_ratio: float) -> tuple[np.ndarray, np.ndarray]:
