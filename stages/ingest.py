@@ -28,6 +28,7 @@ from pipeline.image.colour import convert
 from pipeline.image.exposure import exposure_of
 from pipeline.image.frames import read_frame
 from pipeline.image.raw import file_sha256
+from pipeline.image.sensor import missing, read_bad_pixels, restated
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_latlong, read_linear, read_mask
@@ -269,6 +270,7 @@ def _brackets(
     if facts.chart is not None and facts.chart.files:
         tables["chart"] = ("chart", facts.chart.files)
     stated = _stated_exposures(facts, root, manifest, problems)
+    sensors = _stated_sensors(facts, root, manifest, problems, flaws)
     listing = {}
     for name, (table, wanted) in tables.items():
         listing[name], found = resolve_files(wanted, root, f"{manifest}: {table}.files")
@@ -289,6 +291,7 @@ def _brackets(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         read_files = dict(zip(unique, pool.map(read, unique)))
     flaws.extend(flaw for flaw in read_files.values() if isinstance(flaw, str))
+    _complete(read_files, sensors, flaws, warnings)
     brackets = {}
     for name, files in listing.items():
         frames = [_restated(frame, stated.get(f, {})) for f in files if isinstance(frame := read_files[f], Frame)]
@@ -310,6 +313,50 @@ def _stated_exposures(
         for file in files:
             stated.setdefault(file, {}).update(entry.model_dump(exclude={"files"}, exclude_none=True))
     return stated
+
+
+def _stated_sensors(
+    facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]
+) -> dict[Path, dict[str, Any]]:
+    """What [[sensor]] says, by file, lists of bad pixels read; a later table adds to an earlier one."""
+    stated: dict[Path, dict[str, Any]] = {}
+    for number, entry in enumerate(facts.sensor):
+        files, found = resolve_files(entry.files, root, f"{manifest}: sensor[{number}].files")
+        problems.extend(found)
+        given = entry.model_dump(exclude={"files", "bad_pixels"}, exclude_none=True)
+        if entry.bad_pixels is not None:
+            name = Path(os.path.expandvars(entry.bad_pixels))
+            lists = [folder / name for folder in (manifest.parent, root) if (folder / name).is_file()]
+            try:
+                if lists:
+                    given["bad_pixels"] = read_bad_pixels(lists[0])
+            except CaptureError as error:
+                flaws.append(str(error))
+            if not lists:
+                problems.append(f"{manifest}: sensor[{number}].bad_pixels: is {entry.bad_pixels!r}; no such file")
+        for file in files:
+            stated.setdefault(file, {}).update(given)
+    return stated
+
+
+def _complete(
+    read_files: dict[Path, Frame | str], sensors: dict[Path, dict[str, Any]], flaws: list[str], warnings: list[str]
+) -> None:
+    """Puts what [[sensor]] says into the frames; asks for what is still missing, and says what is odd about them."""
+    odd: dict[str, list[str]] = {}
+    for path, frame in read_files.items():
+        if not isinstance(frame, Frame):
+            continue
+        try:
+            frame = read_files[path] = restated(frame, sensors.get(path, {}))
+        except CaptureError as error:
+            flaws.append(str(error))
+            continue
+        flaws.extend(missing(frame))
+        for mark in frame.marks:
+            odd.setdefault(mark, []).append(frame.file)
+    for mark, names in odd.items():
+        warnings.append(f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}: {mark}")
 
 
 def _restated(frame: Frame, stated: dict[str, float]) -> Frame:

@@ -18,6 +18,7 @@ from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
 from pipeline.run.noise_facts import NoiseFacts
 from pipeline.run.probe_facts import BALL_KINDS, PROBE_KINDS, ProbeFacts
+from pipeline.run.sensor_facts import SensorFacts
 from pipeline.run.strict import Coordinate, Length, Matrix4, Rgb, Share, Strict
 
 
@@ -191,6 +192,7 @@ class CaptureFacts(Strict):
     camera: CameraFacts = CameraFacts()
     pose: list[PoseFacts] = Field([])
     exposure: list[ExposureFacts] = Field([])
+    sensor: list[SensorFacts] = Field([])
     noise: list[NoiseFacts] = Field([])
     proxy: list[ProxyFacts] = Field([])
     room: RoomFacts | None = None
