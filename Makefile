@@ -76,6 +76,9 @@ bench-render: $(READY)  ## measure the render at equal error, for docs/benchmark
 bench-probe: $(READY)  ## measure the probe against truth and peers, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.probe $(BENCH)
 
+bench-colour: $(READY)  ## measure colours of measured cameras against spectra, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.colour
+
 bench-skylibs-env:  ## skylibs for bench-probe, in .skylibs
 	@test -x .skylibs/bin/python || python3 -m venv --without-pip .skylibs
 	python3 -m pip --python .skylibs/bin/python install --quiet skylibs
@@ -95,4 +98,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE

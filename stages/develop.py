@@ -1,15 +1,16 @@
 """Develop merged mosaics to linear ACEScg, with variance and mask.
 
-Method: white balance of the mosaic by AsShotNeutral (so that interpolation does not colour edges), demosaicking
-(bilinear, Malvar-He-Cutler 2004 or Menon 2007), and one 3x3 matrix from camera_rgb to ACEScg by the DNG's one or two
-ColorMatrix tags (DNG 1.7.1 chapter 6, Bradford): the camera's neutral becomes (1, 1, 1) times its green signal. All
-views of one camera model use one profile; another model has its own matrices, and its neutral is how it would see the
-plate's white: however either was set, plate and ball agree. Variances go through squared kernels and squared matrix.
+Method: vignetting undone by flat photographs, the file's own word or lensfun; white balance of the mosaic (so that
+interpolation does not colour edges), demosaicking (bilinear, Malvar-He-Cutler 2004 or Menon 2007), and one 3x3 matrix
+from camera_rgb to ACEScg by the DNG's ColorMatrix and ForwardMatrix tags (DNG 1.7.1 chapter 6, Bradford): the camera's
+neutral becomes (1, 1, 1) times its green signal. The neutral is AsShotNeutral, or a photographed chart's, whose fit is
+the matrix where that is asked for. Data without a mosaic come from the space that they say. All views of one camera
+model use one profile; another model has its own matrices, and its neutral is how it would see the plate's white:
+however either was set, plate and ball agree. Variances go through squared kernels and squared matrix.
 
 Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance of
-neighbouring pixels and channels that kernels and matrix make; vignetting is not corrected. Values that touched a
-clipped photosite are lower bounds: they carry CLIPPED and an infinite variance. Negative and out-of-gamut values are
-kept and counted.
+neighbouring pixels and channels that kernels and matrix make. Values that touched a clipped photosite are lower bounds:
+they carry CLIPPED and an infinite variance. Negative and out-of-gamut values are kept and counted.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
     numbers: dict[str, Any] = {}
     lens = facts.get("lens") or {}
     flats = [view for view in mosaics if view.startswith(FLAT) and lens.get("flat")]
-    chart_view = CHART if facts.get("chart") and CHART in mosaics else "plate"
+    chart_view = CHART if CHART in mosaics else "plate"
     views = [view for view in mosaics if view not in flats and not (view == CHART == chart_view)]
     profiles = {view: profile_of(view, raster) for view, raster in mosaics.items()}
     losses = Losses(lens, {view: mosaics[view] for view in flats}, profiles)
-    if facts.get("chart"):
+    if facts.get("chart") is not None:
         seen = losses.corrected(mosaics[chart_view], profiles[chart_view])
         charted = read_chart(facts["chart"], chart_view, seen, profiles[chart_view])
         profiles = with_chart(profiles, plate_profile(profiles)["camera"], charted)
@@ -79,8 +80,8 @@ def _of_profile(profile: dict[str, Any]) -> list[dict[str, Any]]:
     """What a camera's colours rest on."""
     if profile["space"] != CAMERA_RGB:
         return [_known_space(profile)]
-    if profile["color_matrix"] is None:
-        return []
+    if "fitted" in profile:
+        return []  # the chart's own evidence says it
     return [_adaptation(profile)] + [_one_matrix(profile)] * (profile["color_matrix_2"] is None)
 
 

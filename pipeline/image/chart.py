@@ -9,7 +9,8 @@ Patch values: colour-science (X-Rite under D50, charts made before and after Nov
 ACES white. Under a light of another temperature surfaces change colour by more than adaptation: that change is taken
 from spectra of the same patches (BabelColor's average chart), as a ratio.
 
-Sources: CIE 15 (CIELAB), Sharma, Wu and Dalal 2005 (CIE DE2000, by colour-science), Lam 1985 (Bradford).
+Sources: CIE 15 (CIELAB), CIE 116 (CIE94, whose weights the fit has), Sharma, Wu and Dalal 2005 (CIE DE2000, by
+colour-science), Lam 1985 (Bradford).
 Limits: veiling glare of the lens lifts the dark patches and is not modelled; a light without a colour temperature
 (fluorescent) is taken as the daylight or Planckian spectrum nearest to it.
 """
@@ -135,11 +136,12 @@ def neutral(patches: Patches, known: np.ndarray) -> np.ndarray | None:
     return np.asarray(white / white[1])
 
 
-def fit(patches: Patches, known: np.ndarray, matrix: np.ndarray | None = None) -> Fit | None:
+def fit(patches: Patches, known: np.ndarray, matrix: np.ndarray | None = None, hold_out: bool = True) -> Fit | None:
     """What the patches say, of reflectance ``known`` (24, 3) ACEScg; None with too few of them.
 
     ``matrix`` (3, 3) to ACEScg: it is kept, and only neutral and light are estimated; it must take the photograph's
-    neutral to (1, 1, 1) up to a factor for its errors to be those of the colours.
+    neutral to (1, 1, 1) up to a factor for its errors to be those of the colours. Without ``hold_out``, which takes
+    a fit per patch, ``held_out`` repeats ``delta_e``.
     """
     kept = np.isfinite(patches.mean).all(-1)
     if kept.sum() >= FEWEST_PATCHES:
@@ -155,7 +157,7 @@ def fit(patches: Patches, known: np.ndarray, matrix: np.ndarray | None = None) -
             break
         kept = still
     held_out = found.delta_e.copy()
-    if matrix is None:
+    if matrix is None and hold_out:
         for patch in np.flatnonzero(kept):
             without = kept.copy()
             without[patch] = False

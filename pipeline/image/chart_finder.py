@@ -2,7 +2,7 @@
 
 OpenCV's corners are off by a fifth of a patch, which is too much. Each patch it points at is grown from its middle over
 pixels of its colour; the centroids of those that grow into a square of the right size give the homography, again until
-it stands still. A find counts when its patches have the chart's brightnesses in the chart's order.
+it stands still. A find counts when a 3x3 matrix can make its patches the chart's.
 
 Sources: Ernst, Sivic and others' detector as in OpenCV (cv2.mcc).
 Limits: the chart must be fairly frontal and span some 200 pixels; the detector looks for light squares on a dark frame.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.camera.markers import apply, square_homography
-from pipeline.image import balance
+from pipeline.image import balance, chart
 from pipeline.types import Raster
 
 LONGEST_PX = 1200  # of the picture given to the detector
@@ -21,6 +21,7 @@ CANDIDATES = 4
 GAINS = (1.0, 3.0)  # over the brightest half per cent: a chart in the shade is found in the second
 ALIKE = 0.12  # log difference to a patch's middle that still is the patch
 FEWEST_CENTRES = 10
+FARTHEST = 10.0  # mean delta E of a chart's patches after a fit; 24 equal squares leave 22
 PATCH_SHARE = (0.35, 1.0)  # of a cell's area that a patch may fill
 CENTRES = np.stack(np.meshgrid((np.arange(6) + 0.5) / 6, (np.arange(4) + 0.5) / 4), -1).reshape(-1, 2)
 
@@ -31,14 +32,15 @@ def find(photograph: Raster) -> np.ndarray | None:
     ``photograph``: R G B of any linear space, roughly white balanced, and its mask.
     """
     rgb = photograph.rgb()
-    best, corners = balance.CHART_AGREES, None
+    best, corners = FARTHEST, None
     for rough in _candidates(rgb):
         outline = refined(rgb, rough)
-        if outline is None:
+        if outline is None or balance.area(outline) < 24 * 16:
             continue
-        agreement = balance.chart_agreement(balance.cells_of(photograph, outline, "chart", 1))
-        if agreement > best:
-            best, corners = agreement, outline
+        patches = chart.measure(photograph, outline)
+        read = chart.fit(patches, chart.reference(), hold_out=False)
+        if read is not None and (error := float(read.delta_e[read.used].mean())) < best:
+            best, corners = error, outline
     return corners
 
 
