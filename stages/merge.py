@@ -19,7 +19,7 @@ import json
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -325,9 +325,20 @@ def _exposure_row(frame: Frame, one: Exposed, exposures: Exposures, index: int) 
 def _note_shift(view: str, exposed: Sequence[Exposed], shifts: dict[str, float]) -> None:
     """Largest measured shift [px] between neighbouring frames of a view; views without structure are left out."""
     for short, long in pairwise(exposed):
-        shift = radiometry.measure_shift(long, short)
+        shift = radiometry.measure_shift(_one_plane(long), _one_plane(short))
         if shift is not None:
             shifts[view] = max(shifts.get(view, 0.0), shift)
+
+
+def _one_plane(one: Exposed) -> Exposed:
+    """The frame, or its green channel as (H, W) if it has three."""
+    if one.mosaic.ndim == 2:
+        return one
+    black, limit, shot, floor = (
+        np.full((2, 2), values[0, 1]) for values in (one.black, one.limit, one.noise.shot, one.noise.floor)
+    )
+    model = replace(one.noise, shot=shot, floor=floor)
+    return Exposed(one.mosaic[..., 1], one.exposure, black, one.white, limit, model)
 
 
 def _evidence(
