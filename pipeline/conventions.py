@@ -32,6 +32,9 @@ DARK = 2  # below the noise in every frame
 GHOST = 4  # frames disagree beyond the noise model
 HOT = 8  # defective photosite, replaced from its neighbours of the same colour
 
+# Views that show no scene: photographs of a chart, and of an even surface ("flat_1", ...). Their scale is not used.
+CHART_VIEW, FLAT_VIEW = "chart", "flat_"
+
 ACESCG = "acescg"
 CAMERA_RGB = "camera_rgb"
 RADIANCE_UNIT = "(DN-black)/(white-black)*N^2*100/(t*ISO)"

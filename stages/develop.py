@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import ACESCG, CAMERA_RGB, CLIPPED
+from pipeline.conventions import ACESCG, CAMERA_RGB, CHART_VIEW, CLIPPED, FLAT_VIEW
 from pipeline.image import colour, sensitivities
 from pipeline.image.charted import read_chart, with_chart
 from pipeline.image.demosaic import Method, balanced_rgb
@@ -33,8 +33,6 @@ from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
 
-CHART, FLAT = "chart", "flat_"  # views that are no photographs of the scene
-
 
 def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
     """Photographs by view: R G B in radiance units, ACEScg; variance.RGB; mask."""
@@ -42,9 +40,9 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
     evidence: list[dict[str, Any]] = []
     numbers: dict[str, Any] = {}
     lens = facts.get("lens") or {}
-    flats = [view for view in mosaics if view.startswith(FLAT) and lens.get("flat")]
-    chart_view = CHART if CHART in mosaics else "plate"
-    views = [view for view in mosaics if view not in flats and not (view == CHART == chart_view)]
+    flats = [view for view in mosaics if view.startswith(FLAT_VIEW) and lens.get("flat")]
+    chart_view = CHART_VIEW if CHART_VIEW in mosaics else "plate"
+    views = [view for view in mosaics if view not in flats and not (view == CHART_VIEW == chart_view)]
     profiles = {view: profile_of(view, raster) for view, raster in mosaics.items()}
     losses = Losses(lens, {view: mosaics[view] for view in flats}, profiles)
     if facts.get("chart") is not None:

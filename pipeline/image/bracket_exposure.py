@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.conventions import CHART_VIEW, FLAT_VIEW
 from pipeline.image import computational, exposure, labels, tripod
 from pipeline.image.bracket_noise import Sample, neighbours
 from pipeline.image.cells import planes
@@ -198,6 +199,8 @@ def _warn_links(
     groups = exposure.linked_views(list(views), settings, ratios)
     linked = set().union(*(group for group in groups if "plate" in group)) if "plate" in views else set(views)
     for view in sorted(set(views) - linked):
+        if view == CHART_VIEW or view.startswith(FLAT_VIEW):
+            continue
         warnings.append(
             f"{view}: neither static scene nor exposure setting ties it to the plate; "
             f"its scale rests on labels (about {exposure.LABEL_SIGMA:.0%})"
