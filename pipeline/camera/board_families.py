@@ -157,7 +157,7 @@ def _fit(picture: Markers, centres: np.ndarray) -> tuple[float, float, float] | 
     import cv2
 
     flat = centres[picture.ids]
-    seen = np.array([_crossing(quad) for quad in picture.corners])
+    seen = marker_centres(picture)
     side = float(np.median(np.linalg.norm(picture.corners - np.roll(picture.corners, 1, 1), axis=-1)))
     homography, _ = cv2.findHomography(flat, seen, 0)
     if homography is None:
@@ -171,6 +171,11 @@ def _fit(picture: Markers, centres: np.ndarray) -> tuple[float, float, float] | 
     except np.linalg.LinAlgError:
         return None
     return rms, float(np.median(np.linalg.norm(back - np.roll(back, 1, 1), axis=-1))), side
+
+
+def marker_centres(picture: Markers) -> np.ndarray:
+    """Pictures (N, 2) of the markers' centres."""
+    return np.array([_crossing(quad) for quad in picture.corners]).reshape(-1, 2)
 
 
 def _crossing(quad: np.ndarray) -> np.ndarray:

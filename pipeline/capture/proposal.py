@@ -50,6 +50,7 @@ def text_of(proposal: Proposal, name: str, root: str = ".") -> str:
     ]
     size = next(((s.first.frame.width, s.first.frame.height) for s in [*plates, *balls] or proposal.shots), (0, 0))
     lines += ["", *board_lines(proposal.layout), "", *camera_lines(proposal, everything, size)]
+    lines += chart_lines([(name, shot) for name, shot in zip(["plate", *names], [*plates[:1], *balls])])
     lines += exposure_lines([photo for shot in [*plates, *balls] for photo in shot.photos])
     lines += left_lines(proposal, known)
     return "\n".join(lines) + "\n"
@@ -197,6 +198,19 @@ def camera_lines(proposal: Proposal, everything: Sequence[str], size: tuple[int,
         "[camera]",
         given(*size),
     ]
+
+
+def chart_lines(views: Sequence[tuple[str, Shot]]) -> list[str]:
+    """The [[reference]] table of a 24-patch chart that views show."""
+    seen = [(name, shot.chart) for name, shot in views if shot.chart is not None]
+    if not seen:
+        return []
+    lines = ["", *comment("A 24-patch chart was found in these views; corners are read at half size."), "[[reference]]"]
+    lines += ['name = "chart"', 'kind = "chart"']
+    for name, corners in seen:
+        places = ", ".join(f"[{x:.1f}, {y:.1f}]" for x, y in corners)
+        lines += ["", "[[reference.seen]]", f'view = "{name}"', f"corners_px = [{places}]"]
+    return lines
 
 
 def exposure_lines(photos: Sequence[Photo]) -> list[str]:

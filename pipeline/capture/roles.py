@@ -13,10 +13,11 @@ import numpy as np
 
 from pipeline.camera.board_families import FAMILIES, Layout, Markers, find_markers, layout_of
 from pipeline.camera.markers import tone
-from pipeline.capture.balls import BallSeen, find_ball
+from pipeline.capture.balls import BallSeen, find_ball, raster_of
 from pipeline.capture.grouping import Grouping, compare_all, group, repeats
 from pipeline.capture.likeness import Cells, Likeness, cells_of, compare_moved, relative_exposures
 from pipeline.capture.photographs import Photo, combined
+from pipeline.image import chart_finder
 from pipeline.probes.cropped import find_circle
 from pipeline.run.errors import CaptureError
 
@@ -40,6 +41,7 @@ class Shot:
     role: str = "left"  # ball, plate, calibration, view or left
     name: str = ""
     tripod: bool = False
+    chart: np.ndarray | None = None  # (4, 2) corners px of a 24-patch chart
     because: list[str] = field(default_factory=list)
     unsure: list[str] = field(default_factory=list)
 
@@ -63,6 +65,11 @@ class Proposal:
     left_out: dict[str, str]
     flaws: dict[str, str]
 
+    @property
+    def charted(self) -> bool:
+        """Whether plate and a ball view show a 24-patch chart."""
+        return len([shot for shot in self.shots if shot.chart is not None]) > 1
+
     def of(self, role: str) -> list[Shot]:
         """Brackets of a role."""
         return [shot for shot in self.shots if shot.role == role]
@@ -79,6 +86,7 @@ def propose(photos: Sequence[Photo], flaws: dict[str, str]) -> Proposal:
     shots = with_balls([as_crop(shot) for shot in shots])
     shots = with_plate(shots)
     shots = with_boards(shots, layout)
+    shots = [with_chart(shot) if shot.role in ("plate", "ball") else shot for shot in shots]
     return Proposal(named(shots), layout, {photos[i].frame.file: why for i, why in left_out.items()}, flaws)
 
 
@@ -257,6 +265,18 @@ def with_boards(shots: list[Shot], layout: Layout | None) -> list[Shot]:
             shot = replace(shot, role="view", because=[f"a further view{board}"])
         found.append(shot)
     return found
+
+
+def with_chart(shot: Shot) -> Shot:
+    """A 24-patch chart in a bracket, if it shows one."""
+    neutral = shot.first.frame.as_shot_neutral
+    balanced = shot.light / np.asarray(neutral if neutral is not None else np.ones(3), np.float32)
+    corners = chart_finder.find(raster_of(balanced))
+    if corners is None:
+        return shot
+    corners = corners * shot.first.step
+    text = f"a 24-patch chart about ({corners[:, 0].mean():.0f}, {corners[:, 1].mean():.0f})"
+    return replace(shot, chart=corners, because=[*shot.because, text])
 
 
 def named(shots: list[Shot]) -> list[Shot]:

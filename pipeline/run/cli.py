@@ -85,6 +85,9 @@ def build_parser() -> argparse.ArgumentParser:
     init = verb("init", closure.summary("stages.init"), capture=False)
     init.add_argument("folder", type=Path, help="folder of photographs, searched with all folders below")
     init.add_argument("-o", dest="out", type=Path, help="write it here (default: print it); never overwrites")
+    check = verb("check", closure.summary("stages.check"), capture=False)
+    check.add_argument("capture", type=Path, help="folder of photographs, or a capture.toml")
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
@@ -152,6 +155,10 @@ def dispatch(args: argparse.Namespace) -> int:
 
         init(args.folder, args.out, say)
         return 0
+    if args.verb == "check":
+        from stages.check import check
+
+        return check(args.capture, args.json, say)
     if args.verb == "doctor":
         from pipeline.run.doctor import examine
 
