@@ -211,8 +211,8 @@ def acescg_from_camera(
     """
     if color_matrix is None or abs(np.linalg.det(color_matrix)) < 1e-6:
         raise CaptureError(
-            f"{where}: no usable ColorMatrix1 in the RAW, needed for ACEScg; convert the file to DNG, or photograph a "
-            'chart: [chart] fit = "matrix"'
+            f"{where}: no usable ColorMatrix1 in the RAW, needed for ACEScg; state it, "
+            '[sensor] color_matrix, or photograph a chart, [chart] fit = "matrix"'
         )
     neutral = as_shot_neutral
     if neutral is None:
