@@ -334,3 +334,20 @@ def test_samples_without_content_are_refused(tmp_path):
     path = write_dng(tmp_path / "c.dng", hole, bits=32, without=[50714, 50717])
     with pytest.raises(CaptureError, match="1 values that are no number"):
         back(path)
+
+
+@pytest.mark.parametrize("said", dng.BAYER)
+def test_a_pattern_that_its_own_picture_contradicts_is_refused(tmp_path, said):
+    """Greens of one sensor agree; red and blue exchanged cannot be told from the samples, nor can a grey scene."""
+    rng = np.random.default_rng(4)
+    light = rng.uniform(500, 4000, (160, 192))
+    gains = np.tile([[0.5, 1.0], [1.01, 0.75]], (80, 96))  # RGGB
+    coloured = (512 + light * gains).round().astype(np.uint16)
+    path = write_dng(tmp_path / "a.dng", coloured, cfa=said)
+    if said in ("RGGB", "BGGR"):
+        np.testing.assert_array_equal(back(path), coloured)
+    else:
+        with pytest.raises(CaptureError, match=f"its pattern {said} calls green differ by 4"):
+            back(path)
+    grey = write_dng(tmp_path / "b.dng", (512 + light).round().astype(np.uint16), cfa=said)
+    assert back(grey).shape == light.shape

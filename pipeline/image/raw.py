@@ -40,6 +40,9 @@ DAMAGE = (
     struct.error, AssertionError, NotImplementedError,
 )  # fmt: skip
 
+MIN_SIGNAL = 0.02  # of full scale, of blocks that tell the pattern's phase
+GREENS_DIFFER = 0.05  # half their relative difference
+
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
@@ -171,14 +174,16 @@ def _other_facts(name: str, path: Path, tiff: Any, pages: list[Any]) -> dict[str
 def read_sensor(path: Path, frame: Frame) -> Sensor:
     """Samples of the active area as stored, with measured black and marked defects, from one decode.
 
-    Raises CaptureError when the file cannot be decoded, has another size than ``frame`` says, or is constant below
-    white (LibRaw decodes some damaged files to zeros without an error).
+    Raises CaptureError when the file cannot be decoded, has another size than ``frame`` says, is constant below white
+    (LibRaw decodes some damaged files to zeros without an error), or when its colours contradict its CFA pattern.
     """
     file = _dng_or_none(path, frame)
     if file is None and frame.cfa:
         stored, area = libraw.stored_mosaic(frame.file, path)
         found = _black(stored, optical_black.margins(stored.shape, area), area, frame, "margins")
-        return Sensor(_checked(_crop(stored, area), frame), found, np.zeros((0, 2), int))
+        mosaic = _checked(_crop(stored, area), frame)
+        _refuse_wrong_phase(mosaic, frame)
+        return Sensor(mosaic, found, np.zeros((0, 2), int))
     if file is None or file.kind == "xtrans":
         samples = libraw.developed(frame.file, path, None if file is None else file.area)
         return Sensor(_checked(samples, frame), None, np.zeros((0, 2), int))
@@ -189,6 +194,8 @@ def read_sensor(path: Path, frame: Frame) -> Sensor:
         source = "MaskedAreas" if masked else "margins"
         found = _black(stored, masked or optical_black.margins(stored.shape, file.area), file.area, frame, source)
     samples = _checked(_crop(stored, file.area), frame)
+    if file.kind == "bayer":
+        _refuse_wrong_phase(samples, frame)
     value = dng.defect_value(file.tags)
     defects = np.zeros((0, 2), int) if value is None else np.argwhere(samples == value)
     return Sensor(_flattened(samples, file.tags, frame.white), found, defects)
@@ -239,6 +246,32 @@ def _checked(samples: np.ndarray, frame: Frame) -> np.ndarray:
     if low == high and (high < frame.white or high == 0):  # all at white is a clipped frame, which merge can tell
         raise CaptureError(f"{frame.file}: every pixel is {low:g}, so its RAW data are missing; copy it again")
     return samples
+
+
+def _refuse_wrong_phase(mosaic: np.ndarray, frame: Frame) -> None:
+    """Raises CaptureError where the photosites called green differ and the two others agree: pattern or area is wrong.
+
+    Means over blocks of 16 x 16 cells, every fourth row of blocks. Greens of one sensor agree within 2 %.
+    """
+    size, height, width = 32, *mosaic.shape
+    blocks = mosaic[: height // size * size, : width // size * size]
+    if blocks.shape[0] < 4 * size or blocks.shape[1] < 4 * size:
+        return
+    cells = blocks.reshape(-1, size // 2, 2, blocks.shape[1] // size, size // 2, 2)
+    cells = cells[:: 4 if len(cells) >= 16 else 1]
+    means = cells.mean((1, 4), dtype=np.float32).transpose(0, 2, 1, 3) - frame.black.astype(np.float32)
+    means = means.reshape(-1, 4)
+    means = means[means.max(1) > MIN_SIGNAL * (frame.white - frame.black.mean())]
+    if len(means) < 16:
+        return
+    corner, other = (np.median(np.abs(a - b) / np.maximum(np.abs(a + b), 1e-6)) for a, b in
+                     ((means[:, 0], means[:, 3]), (means[:, 1], means[:, 2])))  # fmt: skip
+    green, rest = (corner, other) if frame.cfa[0] == "G" else (other, corner)
+    if green > GREENS_DIFFER and green > 5 * rest:
+        raise CaptureError(
+            f"{frame.file}: photosites that its pattern {frame.cfa} calls green differ by {2 * green:.0%}, "
+            f"the others by {2 * rest:.0%}: pattern or active area is wrong; give the camera's own file"
+        )
 
 
 def _other_size(frame: Frame, shape: tuple[int, ...]) -> CaptureError:
