@@ -83,6 +83,13 @@ bench-skylibs-env:  ## skylibs for bench-probe, in .skylibs
 	@test -x .skylibs/bin/python || python3 -m venv --without-pip .skylibs
 	python3 -m pip --python .skylibs/bin/python install --quiet skylibs
 
+bench-merge: $(READY)  ## measure the merge against the noise bound, memory bandwidth and peers, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.merge $(BENCH)
+
+bench-merge-env:  ## HDRutils and colour-hdri for bench-merge, in .merge-peers (500 MB)
+	@test -x .merge-peers/bin/python || python3 -m venv --without-pip .merge-peers
+	python3 -m pip --python .merge-peers/bin/python install --quiet HDRutils colour-hdri
+
 bench-cycles-env:  ## Blender's Cycles for bench-render, in .blender (Python 3.11, 1 GB)
 	@test -x .blender/bin/python || python3.11 -m venv --without-pip .blender
 	python3 -m pip --python .blender/bin/python install --quiet 'bpy==5.0.1' 'numpy<2'
