@@ -28,6 +28,7 @@ from pipeline.image.colour import convert
 from pipeline.image.exposure import exposure_of
 from pipeline.image.frames import read_frame
 from pipeline.image.raw import file_sha256
+from pipeline.image.sensitivities import is_known
 from pipeline.image.sensor import missing, read_bad_pixels, restated
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
@@ -291,7 +292,8 @@ def _brackets(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         read_files = dict(zip(unique, pool.map(read, unique)))
     flaws.extend(flaw for flaw in read_files.values() if isinstance(flaw, str))
-    _complete(read_files, sensors, flaws, warnings)
+    charted = facts.chart is not None and facts.chart.fit == "matrix"
+    _complete(read_files, sensors, charted, flaws, warnings)
     brackets = {}
     for name, files in listing.items():
         frames = [_restated(frame, stated.get(f, {})) for f in files if isinstance(frame := read_files[f], Frame)]
@@ -340,9 +342,16 @@ def _stated_sensors(
 
 
 def _complete(
-    read_files: dict[Path, Frame | str], sensors: dict[Path, dict[str, Any]], flaws: list[str], warnings: list[str]
+    read_files: dict[Path, Frame | str],
+    sensors: dict[Path, dict[str, Any]],
+    charted: bool,
+    flaws: list[str],
+    warnings: list[str],
 ) -> None:
-    """Puts what [[sensor]] says into the frames; asks for what is still missing, and says what is odd about them."""
+    """Puts what [[sensor]] says into the frames; asks for what is still missing, and says what is odd about them.
+
+    ``charted``: a chart gives the colour matrix.
+    """
     odd: dict[str, list[str]] = {}
     for path, frame in read_files.items():
         if not isinstance(frame, Frame):
@@ -352,7 +361,7 @@ def _complete(
         except CaptureError as error:
             flaws.append(str(error))
             continue
-        flaws.extend(missing(frame))
+        flaws.extend(missing(frame, matrix=not charted and not is_known(frame.camera)))
         for mark in frame.marks:
             odd.setdefault(mark, []).append(frame.file)
     for mark, names in odd.items():
