@@ -23,6 +23,11 @@ KNOWN = {"NIKON D5100": "Nikon 5100 (NPL)"}  # model as its files name it: colou
 WAVELENGTHS = (380, 780, 5)  # nm: first, last, step
 
 
+def is_known(camera: str) -> bool:
+    """Whether `known_profile` has a profile of the camera."""
+    return any(camera.upper().endswith(model) for model in KNOWN)
+
+
 def known_profile(camera: str) -> dict[str, Any] | None:
     """color_matrix(_2) and illuminant(_2) of a camera that colour-science has measured; None of any other."""
     name = next((name for model, name in KNOWN.items() if camera.upper().endswith(model)), None)

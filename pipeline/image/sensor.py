@@ -59,8 +59,11 @@ def _black(frame: Frame, levels: np.ndarray) -> np.ndarray:
     return np.broadcast_to(levels, 4).reshape(2, 2).copy()
 
 
-def missing(frame: Frame) -> list[str]:
-    """What a frame still lacks, one line each: where, what was found, what to state. Exposure is not looked at."""
+def missing(frame: Frame, matrix: bool = True) -> list[str]:
+    """What a frame still lacks, one line each: where, what was found, what to state. Exposure is not looked at.
+
+    ``matrix``: whether the colour matrix must be the file's or stated; a chart or published sensitivities may give it.
+    """
     lines = []
     if frame.white <= float(np.max(frame.black)):
         said = f"white level {frame.white:g}" if frame.white else "no white level"
@@ -70,10 +73,10 @@ def missing(frame: Frame) -> list[str]:
         )
     if XTRANS_MARK in frame.marks and not np.any(frame.black):  # LibRaw keeps black of some of them elsewhere
         lines.append(f"{frame.file}: black is 0, which no X-Trans sensor has; state black in [[sensor]]")
-    if frame.encoding == "linear" and not frame.space and _no_matrix(frame):
+    if matrix and frame.encoding == "linear" and not frame.space and _no_matrix(frame):
         lines.append(
-            f"{frame.file}: no colour matrix in the file, needed camera_rgb from XYZ; state color_matrix in [[sensor]] "
-            "or convert the file to DNG"
+            f"{frame.file}: no colour matrix in the file, needed camera_rgb from XYZ; state color_matrix in [[sensor]], "
+            'convert the file to DNG, or photograph a chart: [chart] fit = "matrix"'
         )
     return lines
 
