@@ -75,8 +75,8 @@ def missing(frame: Frame, matrix: bool = True) -> list[str]:
         lines.append(f"{frame.file}: black is 0, which no X-Trans sensor has; state black in [[sensor]]")
     if matrix and frame.encoding == "linear" and not frame.space and _no_matrix(frame):
         lines.append(
-            f"{frame.file}: no colour matrix in the file, needed camera_rgb from XYZ; state color_matrix in [[sensor]], "
-            'convert the file to DNG, or photograph a chart: [chart] fit = "matrix"'
+            f"{frame.file}: no colour matrix in the file, needed camera_rgb from XYZ; state color_matrix in [[sensor]]"
+            ', convert the file to DNG, or photograph a chart: [chart] fit = "matrix"'
         )
     return lines
 
