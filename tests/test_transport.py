@@ -1,5 +1,8 @@
 """Laws of the transport: furnace, closed form, common random numbers, exact edges, deterministic bytes."""
 
+import functools
+import gc
+
 import numpy as np
 import pytest
 from agreement import assert_same_mean
@@ -237,3 +240,47 @@ def test_envmap_grid_keeps_a_constant_and_the_poles() -> None:
     grid = envmap_grid(ramp)
     assert grid.shape == (9, 16, 3)
     np.testing.assert_allclose(grid[1:-1, 0, 0], np.arange(7) + 0.5)  # rows of the corner grid lie between ours
+
+
+def test_another_place_compiles_nothing_anew() -> None:
+    """Camera, object, footprint and roughness are inputs of the kernel: the second scene finds it in the cache."""
+    mi = use_mitsuba()
+    import drjit as dr
+
+    seen = []
+    for shift, footprint in ((0.0, 1.0), (0.03, 8.0)):
+        mesh = sphere(0.1 + shift, (shift, 0.1 + shift, 0), Material((0.5, 0.4, 0.3 + shift), 0.0, 0.6 + shift))
+        worlds = scene(sky(), np.array([0.5, 0.4, 0.3 + shift]), mesh)
+        rays = all_rays()
+        moved = Rays(rays.origin + shift, rays.centre, rays.by_x, rays.by_y)
+        dr.eval()
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            trace(difference_block, worlds, moved, 2, 4, 1, footprint)
+            kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        seen.append([k["cache_hit"] for k in kernels])
+        del worlds, mesh  # a kernel holds the numbers of the shapes; they are given out again
+        gc.collect()
+    assert seen[0]
+    assert all(seen[1]), mi.variant()
+
+
+def test_strata_of_a_square_tile_it() -> None:
+    """Their middles surround the square's, evenly; samples of all are those of the square."""
+    rays, along = all_rays(), 3
+    parts = rays.strata(8.0, along)
+    assert len(parts) == 9 * len(rays)
+    first = parts.centre.reshape(-1, 9, 3)
+    np.testing.assert_allclose(first.mean(1), rays.centre, atol=1e-12)
+    right = first[:, [1, 4, 7]] - first[:, [0, 3, 6]]
+    np.testing.assert_allclose(right, np.repeat(rays.by_x[:, None], 3, 1) * 8 / 3, atol=1e-12)
+    down = first[:, 3:] - first[:, :-3]
+    np.testing.assert_allclose(down, np.repeat(rays.by_y[:, None], 6, 1) * 8 / 3, atol=1e-12)
+    worlds = scene(sky(), np.array([0.5, 0.4, 0.3]), sphere(0.1, (0, 0.1, 0), GREY))
+    some = trace(difference_block, worlds, rays[:18], 2, 2, 3)
+    whole = some.gathered(9)
+    assert whole.count.tolist() == [18, 18]
+    np.testing.assert_allclose(whole.albedo[1], some.albedo[9:].mean(0))
+    joined = functools.reduce(lambda a, b: a + b, [some[[k, 9 + k]] for k in range(9)])
+    np.testing.assert_allclose(whole.lost, joined.lost, atol=1e-12)
+    np.testing.assert_allclose(whole.change_variance, joined.change_variance, atol=1e-12)

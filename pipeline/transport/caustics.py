@@ -24,6 +24,7 @@ import numpy as np
 
 from pipeline.transport.directions import direction_density
 from pipeline.transport.scene import LightGroup, Worlds
+from pipeline.transport.variant import kernel_input
 
 MIRRORS = 12  # longest chain of mirrors and glass surfaces
 PHOTONS_PER_SAMPLE = 0.3  # photons for every pixel and every sample of it
@@ -64,11 +65,12 @@ def disc_density(worlds: Worlds, point: Any, direction: Any) -> Any:
 
     mi = worlds.mi
     density = 0.0 * direction.x
-    for x, y, z, radius in worlds.bounds:
-        offset = point - mi.Point3f(float(x), float(y), float(z))
+    for sphere in worlds.bounds:
+        x, y, z, radius = (kernel_input(mi, value) for value in sphere)
+        offset = point - mi.Point3f(x, y, z)
         aside = dr.squared_norm(offset - direction * dr.dot(offset, direction))
-        share = 1 / (np.pi * float(radius) ** 2 * len(worlds.bounds))
-        density += dr.select(aside <= float(radius) ** 2, share, 0.0)
+        share = 1 / (np.pi * dr.square(radius) * len(worlds.bounds))
+        density += dr.select(aside <= dr.square(radius), share, 0.0)
     return density
 
 
@@ -84,7 +86,7 @@ def against_camera(worlds: Worlds, hit: Any, back: Any, light: Any) -> Any:
     lit.wi = hit.to_local(light)
     pdf = hit.bsdf().pdf(mi.BSDFContext(mi.TransportMode.Importance), lit, hit.to_local(back))
     arriving, leaving = dr.abs(dr.dot(hit.n, light)), dr.abs(dr.dot(hit.n, back))
-    ratio = worlds.photons * disc_density(worlds, hit.p, light) * arriving * pdf / leaving
+    ratio = kernel_input(mi, worlds.photons) * disc_density(worlds, hit.p, light) * arriving * pdf / leaving
     return dr.select(leaving > 0, ratio, 0.0)
 
 
@@ -141,7 +143,8 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     disc = mi.warp.square_to_uniform_disk(sampler.next_2d()) * columns[3]
     centre = mi.Point3f(*columns[:3])
     start = centre + mi.Frame3f(light.d).to_world(mi.Vector3f(disc.x, disc.y, 0.0))
-    far = float(np.abs(worlds.plane.corners_m).max() + np.abs(worlds.bounds).sum(1).max()) * 4
+    far = kernel_input(mi, 4 * (np.abs(worlds.plane.corners_m).max() + np.abs(worlds.bounds).sum(1).max()))
+    eye = mi.Point3f(*[kernel_input(mi, v) for v in film.origin])
     flux = dr.select(light.pdf > 0, weight / disc_density(worlds, start, light.d), mi.Color3f(0.0))
     context = mi.BSDFContext(mi.TransportMode.Importance)
 
@@ -188,11 +191,11 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     )
     _, ray, flux, ratio, _, landed, found, _ = dr.while_loop(state, lambda *s: s[0], body, label="photons")
     back = found.to_world(found.wi)  # where the photon came from
-    offset = mi.Point3f(*[float(v) for v in film.origin]) - found.p
+    offset = eye - found.p
     distance = dr.norm(offset)
     toward = offset / distance
     landed &= (dr.dot(found.n, toward) * dr.dot(found.n, back)) > 0
-    sight = found.spawn_ray_to(mi.Point3f(*[float(v) for v in film.origin]))
+    sight = found.spawn_ray_to(eye)
     landed &= ~scene.ray_test(sight, landed)
     if worlds.occluders is not None:
         landed &= ~worlds.occluders.ray_test(sight, landed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.transport.scene import Worlds
+from pipeline.transport.variant import kernel_input
 
 CONE_SHARE = 0.5  # of the directions, where the BSDF is sampled too
 
@@ -29,10 +30,11 @@ def object_cones(worlds: Worlds, origin: Any) -> list[tuple[Any, Any, Any]]:
 
     mi = worlds.mi
     cones = []
-    for x, y, z, radius in worlds.bounds:
-        offset = mi.Vector3f(float(x), float(y), float(z)) - origin
+    for sphere in worlds.bounds:
+        x, y, z, radius = (kernel_input(mi, value) for value in sphere)
+        offset = mi.Vector3f(x, y, z) - origin
         distance = dr.norm(offset)
-        sine = float(radius) * 1.001 / distance
+        sine = radius * 1.001 / distance
         inside = sine >= 0.999
         cosine = dr.select(inside, -1.0, dr.sqrt(dr.maximum(1 - sine * sine, 0.0)))
         # A point inside uses the whole hemisphere with the cosine, of weight 1; a cone 1 - cos of one hemisphere.

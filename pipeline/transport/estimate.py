@@ -62,6 +62,7 @@ FIRST_PILOT = 2  # likewise, before the first picture
 LEAST_PILOT, MOST_PILOT = 16, 512  # samples of a cell before the first picture
 FEW_NOISY = 0.02  # of the cells
 CALM = 0.25  # of the tolerance of interpolation: noise of the pilot that need not be less
+STRATA = 3  # along a cell's side, for a pilot of few samples
 GLANCE_SAMPLES = 2  # of a square; as many as the first pass takes, so that kernels are compiled once
 GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
@@ -275,7 +276,7 @@ def looked(
     square = (np.arange(grid[0])[:, None] // GLANCE * coarse[1] + np.arange(grid[1]) // GLANCE).ravel()  # of each cell
     bounces = light_by_cell(worlds, film, grid, effort) if film is not None else np.zeros((len(index), 3))
 
-    def traced(seen: Rays, samples: int, seed: int, side: int) -> Samples:
+    def traced(seen: Rays, samples: int, seed: int, side: float) -> Samples:
         return trace(difference_block, worlds, seen, samples, effort.depth, effort.stream + seed, side, progress)
 
     closed = worlds.convex and worlds.diffuse
@@ -290,7 +291,12 @@ def looked(
     wanted = worth_a_look(glance, glance.albedo * cell_light / np.pi, grid, limits, near)
     some, samples = np.flatnonzero(wanted), glance
     if len(some):
-        found = traced(rays[index[some]], pilot_samples(effort), 1, CELL)
+        few = pilot_samples(effort) <= GLANCE_SAMPLES * STRATA**2  # one kernel does for glance, pilot and first pass
+        if few:
+            parts = rays[index[some]].strata(CELL, STRATA)
+            found = traced(parts, GLANCE_SAMPLES, 1, CELL / STRATA).gathered(STRATA**2)
+        else:
+            found = traced(rays[index[some]], pilot_samples(effort), 1, CELL)
         samples = glance.replaced(some, replace(found, gained=found.gained + bounces[some]))
     if not closed and len(some):
         part = np.ix_(*(np.arange(there.min(), there.max() + 1) for there in np.nonzero(wanted.reshape(grid))))

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.camera.lens import rays_through
 from pipeline.transport.scene import Worlds
+from pipeline.transport.variant import kernel_input
 from pipeline.types import Camera
 
 RAYS_PER_BLOCK = 1 << 21  # wavefront size: 30 floats per ray are kept until the samples of a pixel are summed
@@ -52,6 +53,14 @@ class Rays:
 
     def __len__(self) -> int:
         return len(self.centre)
+
+    def strata(self, side_px: float, along: int) -> Rays:
+        """Through the middles of ``along`` x ``along`` parts of each square of ``side_px``, square after square."""
+        step = (np.arange(along) - (along - 1) / 2) * side_px / along
+        down, right = (axis.ravel()[None, :, None] for axis in np.meshgrid(step, step, indexing="ij"))
+        centre = self.centre[:, None] + right * self.by_x[:, None] + down * self.by_y[:, None]
+        each = along * along
+        return Rays(self.origin, centre.reshape(-1, 3), np.repeat(self.by_x, each, 0), np.repeat(self.by_y, each, 0))
 
     def solid_angles(self) -> np.ndarray:
         """(N,) of the pixels [sr]."""
@@ -136,6 +145,12 @@ class Samples:
             blended[name] = a * share + b * (1 - share)
         return Samples(**blended)
 
+    def gathered(self, each: int) -> Samples:
+        """Every ``each`` pixels, of as many samples, as if they were one."""
+        whole = {f.name: getattr(self, f.name) for f in fields(self)}
+        means = {n: v.reshape(len(v) // each, each, *v.shape[1:]).mean(1) for n, v in whole.items()}
+        return Samples(**{**means, "count": means["count"] * each})
+
     def placed(self, index: np.ndarray, more: Samples) -> Samples:
         """``more`` samples of the pixels ``index`` added to those; the rest as they are."""
         return self.replaced(index, self[index] + more)
@@ -185,14 +200,14 @@ def trace(
 def camera_rays(mi: Any, dr: Any, rays: Rays, samples: int, jitter: Any, footprint_px: float) -> Any:
     """A ray per sample; ``jitter`` in [0, 1)^2 places it in the footprint."""
     pixel = dr.arange(mi.UInt32, len(rays) * samples) // samples
-    offset = (jitter - 0.5) * footprint_px
+    offset = (jitter - 0.5) * kernel_input(mi, footprint_px)
 
     def fetch(rows: np.ndarray) -> Any:
         columns = [mi.Float(np.ascontiguousarray(rows[:, i], np.float32)) for i in range(3)]
         return mi.Vector3f(*[dr.gather(mi.Float, column, pixel) for column in columns])
 
     direction = fetch(rays.centre) + fetch(rays.by_x) * offset.x + fetch(rays.by_y) * offset.y
-    return mi.RayDifferential3f(mi.Point3f(*[float(v) for v in rays.origin]), dr.normalize(direction))
+    return mi.RayDifferential3f(mi.Point3f(*[kernel_input(mi, v) for v in rays.origin]), dr.normalize(direction))
 
 
 def make_sampler(mi: Any, samples: int) -> Any:

@@ -57,6 +57,13 @@ def use_mitsuba() -> Any:
     raise ToolError("mitsuba: no variant loads; " + "; ".join(reasons) + "; run insitu doctor")
 
 
+def kernel_input(mi: Any, value: float) -> Any:
+    """A number that a compiled kernel is given, not one that is part of it: another value compiles nothing anew."""
+    import drjit as dr
+
+    return dr.opaque(mi.Float, float(value))
+
+
 def switch_to(kind: str) -> Any:
     """Mitsuba in its ``spectral`` or ``rgb`` variant of the best backend; later calls switch the whole process.
 
