@@ -9,12 +9,14 @@ import pytest
 from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from benchmarks.probe_fit import Setup, fitted
+from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes.anchor import anchored
-from pipeline.probes.finding import Found
-from pipeline.probes.outline import Height, radius_in_pixels
+from pipeline.probes.finding import Found, measured, refuse_cut
+from pipeline.probes.outline import Height, part_of, radius_in_pixels
 from pipeline.probes.plane_image import Aligned, align
-from pipeline.probes.sphere_fit import SphereFit
+from pipeline.probes.sphere_fit import SphereFit, fit_sphere
+from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Raster, View
 
 RADIUS = 0.04
@@ -80,6 +82,26 @@ def test_small_balls(radius_px, ratio, blur_px):
     found = fitted(setup, on_plane=True)
     assert found["direction_rms_deg"] < 1.0  # rms over 24 such balls 0.13 (D = 3 R) to 0.49 (30 px); rim 0.65 to 3
     assert found["mahalanobis_squared"] < 11.3  # 99 %
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_half_a_ball_is_enough(picture, side):
+    """The frame ends at the ball's middle: by its rim alone such a ball was off by up to 2 degrees."""
+    true = transform_points(invert_rigid(POSE), CENTRE)
+    middle = int(project(CAMERA, true[None])[0, 0])
+    low, high = np.array([0, 0]), np.array([CAMERA.width, CAMERA.height])
+    (low if side > 0 else high)[0] = middle
+    half = Raster({k: v[:, low[0] : high[0]] for k, v in picture.channels.items()}, "acescg")
+    camera = part_of(CAMERA, low, high)
+    start = ball((0.5, -0.5))
+    fit, _ = fit_sphere(*measured(half), camera, RADIUS, start.fit.centre, start.height)
+    assert 0.45 < fit.visible < 0.55
+    assert (fit.centre - true) @ np.linalg.solve(fit.covariance, fit.centre - true) < 11.3  # 99 %
+    found, numbers = anchored(replace(start, fit=fit, free=fit), half, camera, VIEW, RADIUS)
+    assert numbers["used"]
+    assert across_px(found) < 0.24
+    with pytest.raises(CaptureError, match="needed 70%"):
+        refuse_cut("ball", fit)
 
 
 def test_a_pose_that_is_wrong_is_in_the_covariance(picture):

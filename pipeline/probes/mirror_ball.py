@@ -17,7 +17,7 @@ from pipeline.probes import combine, photographer, sphere_fit
 from pipeline.probes.anchor import anchored
 from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
-from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, solve_radius
+from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, refuse_cut, solve_radius
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.outline import part_of
@@ -55,6 +55,8 @@ class MirrorBall:
             found[name], anchors[name] = anchored(
                 found[name], photographs[name], shots.camera_of(name), views[name], radius
             )
+            if not anchors[name]["used"]:
+                refuse_cut(name, found[name].fit, why=f" as {anchors[name]['why']}")
         known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM))
         warnings += known.warnings
         maps = {
