@@ -53,6 +53,7 @@ from pipeline.types import Bracket, Frame, Raster, Result
 from stages import knobs
 
 HELD_BYTES = 2**30  # of decoded photographs kept between their statistics and their merge; the others are read again
+NUMBER_SAMPLES = 4_000_000  # of a view, for its middle and its range
 SHIFT_WARNING_PX = 0.5
 
 
@@ -118,10 +119,12 @@ def merge_brackets(
         exposed = [photographs.exposed(i, sensor, exposures) for i in members]
         _note_shift(view, exposed, shifts)
         listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
-        merged[view], hot = _merge_view(exposed, photographs.defects(members), params)
+        merged[view] = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
+        exposed.clear()
+        photographs.release(members)
+        merged[view], hot = _without_defects(merged[view], photographs.defects(members))
         numbers[view] = _view_numbers(merged[view], hot, len(members))
         _warn_extremes(view, numbers[view], warnings)
-        photographs.release(members)
     patterns = _add_fixed_patterns(merged, views, frames, sensor)
     for view, pattern in patterns.items():
         numbers[view]["prnu"] = pattern.prnu if pattern.believed else 0.0
@@ -186,12 +189,11 @@ class _Photographs:
             self._held.pop(i, None)
 
 
-def _merge_view(exposed: Sequence[Exposed], listed: np.ndarray, params: knobs.Merge) -> tuple[Merged, int]:
-    """Merged frames of one view, and how many defects were replaced: those listed and, in a mosaic, what stands out.
+def _without_defects(merged: Merged, listed: np.ndarray) -> tuple[Merged, int]:
+    """Defects replaced, and how many: those listed and, in a mosaic, what stands out of its neighbours.
 
     Data without a mosaic are interpolated: a defect is no single sample there.
     """
-    merged = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
     count = defects.replace_listed(merged.radiance, merged.variance, merged.mask, listed)
     if merged.radiance.ndim == 3:
         return merged, count
@@ -268,19 +270,26 @@ def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:
 
 
 def _view_numbers(merged: Merged, hot: int, frames: int) -> dict[str, Any]:
-    seen = np.isfinite(merged.variance)
-    bright = seen & (merged.mask & DARK == 0)
-    snr = merged.radiance[bright] / np.sqrt(merged.variance[bright])
+    """What is written of one view; middle and range of large pictures from evenly spaced rows."""
+    rows = slice(None, None, max(1, merged.radiance.size // NUMBER_SAMPLES))
+    radiance, variance = merged.radiance[rows], merged.variance[rows]
+    bright = np.isfinite(variance) & (merged.mask[rows] & DARK == 0)
+    snr = radiance[bright] / np.sqrt(variance[bright])
     return {
         "frames": frames,
-        "clipped_fraction": float(np.mean(merged.mask & CLIPPED > 0)),
-        "dark_fraction": float(np.mean(merged.mask & DARK > 0)),
-        "ghost_fraction": float(np.mean(merged.mask & GHOST > 0)),
-        "negative_fraction": float(np.mean(merged.radiance < 0)),
+        "clipped_fraction": _share(merged.mask, CLIPPED),
+        "dark_fraction": _share(merged.mask, DARK),
+        "ghost_fraction": _share(merged.mask, GHOST),
+        "negative_fraction": np.count_nonzero(merged.radiance < 0) / merged.radiance.size,
         "hot_pixels": hot,
         "median_snr": float(np.median(snr)) if snr.size else 0.0,
-        "range_stops": _stops(merged.radiance[bright]),
+        "range_stops": _stops(radiance[bright]),
     }
+
+
+def _share(mask: np.ndarray, bit: int) -> float:
+    """Share of the samples that carry a bit."""
+    return sum(np.count_nonzero(mask[start : start + 256] & bit) for start in range(0, len(mask), 256)) / mask.size
 
 
 def _stops(radiance: np.ndarray) -> float:

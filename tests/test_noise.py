@@ -90,6 +90,8 @@ def test_flat_dark_and_tiny_frames_are_declined():
     assert transfer.from_transfer(bins_of(dark, 0.25), STEP) is None
     assert transfer.transfer_bins(dark[0][:1, :2], dark[1][:1, :2], 0.25, 0.97, STEP) == []
     assert transfer.from_transfer([], STEP) is None
+    one = expose(hills(), 0.25, random)
+    assert transfer.from_transfer(bins_of([one, one], 1.0), STEP) is None  # the same frame twice
 
 
 # where a model comes from

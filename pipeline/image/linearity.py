@@ -59,6 +59,8 @@ def compare(long: np.ndarray, short: np.ndarray, ratio: float, limit: float, noi
     tested = np.flatnonzero(np.isfinite(error))
     below = departure < -np.maximum(KNEE, EVIDENCE * error)
     count = len(tested)
+    if count and departure[tested[-1]] > -2 * KNEE:
+        below[:] = False  # a knee bends on; grain that clips in single samples comes to half of this
     while count > 0 and below[tested[count - 1]]:
         count -= 1
     first = float(LEVELS[tested[count] - 1]) if count < len(tested) else 0.0

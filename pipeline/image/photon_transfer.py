@@ -23,6 +23,7 @@ MIN_BIN = 200  # samples in a bin: its variance is then known to 10 %
 MAX_SAMPLES = 60_000  # of one pair of frames and colour
 OUTLIERS = 5.0  # in robust standard deviations: motion, hot photosites, edges
 EDGES = np.concatenate([[-np.inf], np.geomspace(2e-4, 1.0, 25)])
+LEAST_ERROR = 1e-3  # relative, of a bin's variance, however alike its samples
 EVIDENCE = 3.0  # sigmas at which a further term, or a gain per colour, is believed
 
 
@@ -105,13 +106,14 @@ def _fit(bins: Sequence[Bin], step: float) -> tuple[float, float, float, float] 
         return None
     terms = np.array([[b.signal_term, b.floor_term, b.square_term] for b in bins])
     variance, least = np.array([b.variance for b in bins]), step**2 / 12
-    weight = 1 / np.array([max(b.sigma, least * 1e-3) for b in bins])
+    relative = np.array([max(b.sigma / max(b.variance, least), LEAST_ERROR) for b in bins])
+    weight = 1 / (relative * np.maximum(variance, least))
     for _ in range(3):  # a bin that came out low must not weigh more for it: its sigma is that of the fitted variance
         solution, covariance, chi2 = _least_squares(terms[:, :2] * weight[:, None], variance * weight)
         if solution is None or covariance is None:
             return None
         model = np.maximum(terms[:, :2] @ np.maximum(solution, [0, least]), least)
-        weight = 1 / (np.array([b.sigma / max(b.variance, least) for b in bins]) * model)
+        weight = 1 / (relative * model)
     if len(bins) > 4:
         fuller, spread, score = _least_squares(terms * weight[:, None], variance * weight)
         if fuller is not None and spread is not None and fuller[2] > EVIDENCE * np.sqrt(spread[2, 2] * max(score, 1)):
