@@ -25,13 +25,15 @@ import numpy as np
 from pipeline.conventions import ACESCG, CAMERA_RGB, CHART_VIEW, CLIPPED, FLAT_VIEW
 from pipeline.image import colour, sensitivities
 from pipeline.image.charted import read_chart, with_chart
-from pipeline.image.demosaic import Method, balanced_rgb
+from pipeline.image.demosaic import Method, balance_gains, balanced_rgb, interpolation_variance
 from pipeline.image.vignetting import Losses
 from pipeline.run.artifacts import FACTS, MOSAICS, PHOTOGRAPHS
 from pipeline.run.errors import ArtifactError
 from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
+
+EDGE_PX = 1024  # side of the middle of the plate on which the error of interpolation is measured
 
 
 def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Develop) -> Result:
@@ -61,6 +63,10 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         photographs = dict(zip(views, pool.map(one, views)))
     numbers |= {"views": {view: _numbers(raster) for view, raster in photographs.items()}, **losses.numbers}
+    shown_in = "plate" if "plate" in views else views[0]
+    if mosaics[shown_in].attributes["insitu:cfa"]:
+        numbers["interpolation"] = edge_error(mosaics[shown_in], acescg_of(profiles[shown_in], shown_in))
+        evidence.append(_interpolation(shown_in, numbers["interpolation"]))
     evidence = [*losses.evidence(views, profiles, {view: mosaics[view].shape for view in views}), *evidence]
     warnings += losses.warnings
     plate = plate_profile(profiles)
@@ -72,6 +78,36 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
         if profile["camera"] != plate["camera"]:
             evidence.append(_other_camera(profile))
     return Result({"photographs": photographs}, numbers, warnings, evidence)
+
+
+def edge_error(mosaic: Raster, acescg_from_camera: np.ndarray) -> dict[str, float]:
+    """How large the error of interpolation is in the middle of a mosaic, white balanced, against its noise."""
+    cfa, (height, width) = str(mosaic.attributes["insitu:cfa"]), mosaic.shape
+    top, left = (max(0, (size - EDGE_PX) // 4 * 2) for size in (height, width))
+    part = np.s_[top : top + EDGE_PX, left : left + EDGE_PX]
+    neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
+    gains = balance_gains(neutral, cfa, (height, width))
+    values, variance = (mosaic["Y"] * gains)[part], (mosaic["variance"] * gains * gains)[part]
+    usable = np.isfinite(variance)
+    spread = interpolation_variance(values, np.where(usable, variance, 0), cfa)[usable]
+    level = np.maximum(np.abs(values[usable]), 1e-30)
+    if not usable.any():
+        return {"beyond_noise_fraction": 0.0, "median_rel": 0.0, "p95_rel": 0.0}
+    relative = np.sqrt(spread.max(-1)) / level
+    return {
+        "beyond_noise_fraction": float(np.mean(spread.max(-1) > variance[usable])),
+        "median_rel": float(np.median(relative)),
+        "p95_rel": float(np.percentile(relative, 95)),
+    }
+
+
+def _interpolation(view: str, numbers: dict[str, float]) -> dict[str, Any]:
+    return {
+        "term": "interpolation error in the variance",
+        "modelled": False,
+        "because": f"it is no noise; beyond the noise in {numbers['beyond_noise_fraction']:.0%} of {view}'s middle",
+        "could_cost": f"values there are off by {numbers['median_rel']:.1%} (median), {numbers['p95_rel']:.1%} (95 %)",
+    }
 
 
 def _of_profile(profile: dict[str, Any]) -> list[dict[str, Any]]:

@@ -59,6 +59,9 @@ _SETS: dict[str, tuple[Kernel, Kernel, Kernel, Kernel]] = {
 
 def kernel_for(method: str, cfa: str, colour: str, row: int, column: int) -> Kernel:
     """The kernel that gives ``colour`` at the photosite (row, column) of the 2x2 cell ``cfa``."""
+    if method == "difference":
+        malvar, bilinear = (kernel_for(one, cfa, colour, row, column) for one in ("malvar", "bilinear"))
+        return {at: malvar.get(at, 0) - bilinear.get(at, 0) for at in malvar.keys() | bilinear.keys()}
     here = cfa[2 * row + column]
     green, beside, above, corners = _SETS[method]
     if here == colour:
@@ -82,6 +85,28 @@ def demosaic(mosaic: np.ndarray, cfa: str, method: Method) -> np.ndarray:
 def demosaic_variance(variance: np.ndarray, cfa: str, method: Method) -> np.ndarray:
     """(H, W, 3) float32 variance of `demosaic`, for samples that are independent and finite."""
     return _apply(variance, cfa, "bilinear" if method == "menon" else method, power=2)
+
+
+def balance_gains(neutral: np.ndarray, cfa: str, shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) float32 that white balance a mosaic whose white is (3,)."""
+    cell = np.array([1 / neutral["RGB".index(letter)] for letter in cfa], np.float32).reshape(2, 2)
+    return np.tile(cell, ((shape[0] + 1) // 2, (shape[1] + 1) // 2))[: shape[0], : shape[1]]
+
+
+def interpolation_variance(mosaic: np.ndarray, variance: np.ndarray, cfa: str) -> np.ndarray:
+    """(H, W, 3) float32 squared error that interpolation makes besides the noise, zero where none shows.
+
+    Where bilinear and Malvar's kernels disagree beyond noise, each is wrong by about as much as they differ: the mean
+    over 3x3 pixels of their squared difference, less its noise. On the kitchen_table's plate against its truth the 68
+    and 95 % intervals of Malvar's hold 44 and 68 % of the values without it, 74 and 94 % with it (10 000 electrons; at
+    1 000: 58 and 86, 72 and 95). It is an error and no noise: it hides no border and averages out over no texture.
+    """
+    difference = demosaic(mosaic, cfa, "malvar") - demosaic(mosaic, cfa, "bilinear")
+    excess = difference**2 - _apply(variance, cfa, "difference", power=2)
+    padded = np.pad(excess, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    height, width = mosaic.shape
+    total = sum(padded[dy : dy + height, dx : dx + width] for dy, dx in np.ndindex(3, 3))
+    return np.maximum(np.asarray(total, np.float32) / 9, 0)
 
 
 def _apply(mosaic: np.ndarray, cfa: str, method: str, power: int) -> np.ndarray:
@@ -119,9 +144,7 @@ def balanced_rgb(merged: Raster, neutral: np.ndarray, method: Method) -> tuple[n
     if not cfa:
         gains = (1 / neutral).astype(np.float32)
         return merged.rgb() * gains, merged.rgb("variance") * gains**2, merged["mask"]
-    cell = np.array([1 / neutral["RGB".index(letter)] for letter in cfa], np.float32).reshape(2, 2)
-    height, width = merged.shape
-    gains = np.tile(cell, ((height + 1) // 2, (width + 1) // 2))[:height, :width]
+    gains = balance_gains(neutral, cfa, merged.shape)
     variance = merged["variance"] * gains * gains
     known = np.where(np.isfinite(variance), variance, 0)
     # DARK stays with its photosite, for it is no defect
