@@ -11,7 +11,7 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 from benchmarks.probe_fit import Setup, fitted
 from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, transform_points
-from pipeline.probes.anchor import anchored
+from pipeline.probes.anchor import anchored, anchored_radius
 from pipeline.probes.finding import Found, measured, refuse_cut
 from pipeline.probes.outline import Height, part_of, radius_in_pixels
 from pipeline.probes.plane_image import Aligned, align
@@ -102,6 +102,17 @@ def test_half_a_ball_is_enough(picture, side):
     assert across_px(found) < 0.24
     with pytest.raises(CaptureError, match="needed 70%"):
         refuse_cut("ball", fit)
+
+
+@pytest.mark.parametrize("wrong", [0.97, 1.02])
+def test_radius_is_solved_by_the_planes_image(picture, wrong):
+    # The rim alone leaves 0.5 to 2 %; the ball stands on the plane to 0.5 % of its radius, an eighth of which is left.
+    true = transform_points(invert_rigid(POSE), CENTRE)
+    start = replace(ball((0.0, 0.0)).fit, centre=true * wrong)
+    found = anchored_radius(start, picture, CAMERA, VIEW, RADIUS * wrong)
+    assert found is not None
+    assert abs(found[0] - RADIUS) < 3 * found[1]
+    assert found[1] < 0.003 * RADIUS
 
 
 def test_a_pose_that_is_wrong_is_in_the_covariance(picture):

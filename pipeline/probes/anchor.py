@@ -15,13 +15,46 @@ import numpy as np
 
 from pipeline.conventions import transform_points
 from pipeline.probes import plane_image, sphere_fit
-from pipeline.probes.finding import Found
+from pipeline.probes.finding import Found, height_prior
+from pipeline.probes.sphere_fit import SphereFit
 from pipeline.types import Camera, Raster, View
 
 MOST_LEFT_PX = 0.6  # that the alignment may leave: 0.03 to 0.2 on simulated balls
 MOST_CHI2 = 25.0  # of the two centres, 3 degrees of freedom: beyond, one of them is wrong
 SURE_PX = 0.35  # that it may leave to be believed against the rim
 MOST_MOVED_PX, MOST_HEIGHT_SIGMA = 4.0, 3.0  # and how far it may be then: dents can look like a centre that is farther
+
+# Of a solved radius: rounds, the slope of the height by it that is assumed at first, where it is settled (relative).
+RADIUS_ROUNDS, FIRST_SLOPE, SETTLED = 6, -8.0, 3e-4
+
+
+def anchored_radius(
+    fit: SphereFit, photograph: Raster, camera: Camera, view: View, radius: float
+) -> tuple[float, float] | None:
+    """Radius [m] and its standard uncertainty of a ball on the plane, by the plane's mirror image; None where it fails.
+
+    ``fit`` has the outline, for an assumed ``radius``. For a radius that is too large by a millimetre the image puts
+    the centre 5 to 10 mm too low under the plane's height for it, so that the height, which is known, gives the radius
+    (secant method). Pose's errors are in the sigma of both, as if they were independent.
+    """
+    centre, slope, before = fit.centre, FIRST_SLOPE, None
+    for _ in range(RADIUS_ROUNDS):
+        aligned = plane_image.align(photograph, camera, view, centre, radius, fit.blur_px)
+        if aligned is None:
+            return None
+        height = height_prior(view, radius)
+        over = height.of(aligned.centre) - radius
+        if before is not None and abs(radius - before[0]) > SETTLED * radius:
+            slope = (over - before[1]) / (radius - before[0])
+        if slope > 0.3 * FIRST_SLOPE:  # of a radius alone it is -1: the image says nothing
+            return None
+        step = float(np.clip(-over / slope, -0.03 * radius, 0.03 * radius))
+        if abs(step) < SETTLED * radius and aligned.left_px <= SURE_PX:
+            variance = float(height.normal @ aligned.covariance @ height.normal) + height.sigma_m**2
+            return radius + step, float(np.sqrt(variance)) / abs(slope)
+        before = (radius, over)
+        centre, radius = aligned.centre * (radius + step) / radius, radius + step
+    return None
 
 
 def anchored(

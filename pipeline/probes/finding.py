@@ -104,8 +104,8 @@ def find_ball(
 def solve_radius(
     name: str, photograph: Raster, plate: Raster | None, camera: Camera, view: View,
     click_px: tuple[float, float] | None = None,
-) -> tuple[float, float]:  # fmt: skip
-    """Radius [m] and its standard uncertainty of a ball of unknown size that stands on the plane.
+) -> tuple[float, float, sphere_fit.SphereFit]:  # fmt: skip
+    """Radius [m] and its standard uncertainty of a ball of unknown size that stands on the plane, and its fit.
 
     The outline is found at any size and fitted without the plane; the sphere along its cone that touches the plane is
     the ball. Raises CaptureError when there is none, or its outline leaves the radius open by a quarter.
@@ -128,7 +128,7 @@ def solve_radius(
             f"{name}: the plane gives a ball radius of {radius * 1e3:.1f} +- {sigma * 1e3:.1f} mm, needed 25 % or "
             "better; give probe.diameter_m"
         )
-    return radius, sigma
+    return radius, sigma, replace(pair[1], centre=pair[1].centre * radius / nominal)
 
 
 def height_prior(view: View, radius: float) -> Height:

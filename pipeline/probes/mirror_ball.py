@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.conventions import CLIPPED, invert_rigid, latlong_solid_angles
 from pipeline.probes import combine, photographer, sphere_fit
-from pipeline.probes.anchor import anchored
+from pipeline.probes.anchor import anchored, anchored_radius
 from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, refuse_cut, solve_radius
@@ -98,15 +98,13 @@ def radius_of(shots: Shots, names: list[str], tripod: set[str], warnings: list[s
     if diameter is not None:
         return 0.5 * float(diameter), 0.0
     clicks = {ball["name"]: ball.get("click_px") for ball in shots.facts["ball"]}
-    solved = np.array(
-        [
-            solve_radius(
-                name, shots.photographs[name], shots.photographs["plate"] if name in tripod else None,
-                shots.camera_of(name), shots.views[name], clicks[name],
-            )
-            for name in names
-        ]
-    )  # fmt: skip
+    each = []
+    for name in names:
+        photograph, camera, view = shots.photographs[name], shots.camera_of(name), shots.views[name]
+        plate = shots.photographs["plate"] if name in tripod else None
+        *by_rim, fit = solve_radius(name, photograph, plate, camera, view, clicks[name])
+        each.append(anchored_radius(fit, photograph, camera, view, by_rim[0]) or tuple(by_rim))
+    solved = np.array(each)
     weight = 1 / solved[:, 1] ** 2
     radius, sigma = float((weight * solved[:, 0]).sum() / weight.sum()), float(weight.sum() ** -0.5)
     warnings.append(
