@@ -162,13 +162,13 @@ def ball_rows(build: Build) -> dict[str, Any] | None:
 
 
 def merge_part(build: Build) -> dict[str, Any]:
-    """Exposures as labelled and estimated; masks."""
+    """Exposures as labelled, and as estimated against what the label means; masks."""
     head = ["frame", "label", "estimated", "σ", "clipped"]
     tables = []
     for view, frames in build.exposures.items():
         rows = [
             [f["file"], shutter(f["label_s"]),
-             f"{100 * (f['estimated_s'] / f['label_s'] - 1):+.2f} %".replace("-", "−"),
+             f"{100 * (f['estimated_s'] / f.get('nominal_s', f['label_s']) - 1):+.2f} %".replace("-", "−"),
              fig.reading("_rel", f["sigma_rel"]), fig.reading("_fraction", f["clipped_fraction"])]
             for f in frames if f.get("label_s")
         ]  # fmt: skip
