@@ -4,7 +4,8 @@ Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares
 (Gauss-Newton, poses eliminated). From one focal length without distortion, the terms k1, k2, separate fx and fy, p1 p2
 and k3 are offered in turn, twice; a term stays when photographs that it was not fitted to gain more than 9 in deviance
 per parameter (three standard errors of a Gaussian) and do so consistently. Covariance: inverse normal matrix of the
-chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Limits:
+chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Without
+board photographs the lens comes from the tracks of the further views (stage sfm), with the same covariance. Limits:
 one focus and zoom for all photographs of a camera; a flat board; terms left out have no variance, so the evidence says
 what they could cost.
 """
@@ -23,10 +24,11 @@ from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_ve
 from pipeline.camera.lens import project, unproject
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration, read_grey
 from pipeline.camera.resection import refine, robust_scale
-from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS, VIEW_CAMERAS
+from pipeline.camera.sfm import self_calibrated
+from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Result
+from pipeline.types import Camera, Reconstruction, Result
 from stages import knobs
 
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",))
@@ -52,12 +54,18 @@ class Photos:
         return Photos(*([values[i] for i in chosen] for values in (self.files, self.world_m, self.px)))  # type: ignore[arg-type]
 
 
-def compute(facts: dict[str, Any], board_photos: list[dict[str, str]], params: knobs.Calibrate) -> Result:
+def compute(
+    facts: dict[str, Any], board_photos: list[dict[str, str]], reconstruction: Reconstruction, params: knobs.Calibrate
+) -> Result:
     """The plate's camera (pixels with the first centre at (0.5, 0.5)), and those of balls that state their own.
 
     Balls that state one camera in the same words share one estimate; their figures bear the first one's name.
     """
-    whole = calibrated(facts, "camera", facts["camera"], photos_of(board_photos, "plate"), params)
+    stated, photos = facts["camera"], photos_of(board_photos, "plate")
+    if not stated.get("given") and not photos:
+        whole = from_tracks(reconstruction)
+    else:
+        whole = calibrated(facts, "camera", stated, photos, params)
     cameras: dict[str, Camera] = {}
     done: list[tuple[dict[str, Any], Camera]] = []
     for number, ball in enumerate(facts.get("ball", [])):
@@ -75,6 +83,23 @@ def compute(facts: dict[str, Any], board_photos: list[dict[str, str]], params: k
             whole.evidence.extend({**row, "term": f"{row['term']} ({ball['name']})"} for row in found.evidence)
         cameras[ball["name"]] = same
     return Result({**whole.outputs, "view_cameras": cameras}, whole.numbers, whole.warnings, whole.evidence)
+
+
+def from_tracks(reconstruction: Reconstruction) -> Result:
+    """The plate's camera from the tracks of the reconstruction, for want of board photographs."""
+    if "plate" not in reconstruction.names:
+        raise CaptureError(
+            "plate: hangs together with none of the further views, needed one and the same lens in both; photograph "
+            "them nearer to the plate's place, or a board for [camera] calibration"
+        )
+    camera, numbers, evidence = self_calibrated(reconstruction, 0)
+    warnings = []
+    if numbers["focal_sigma_rel"] > 0.01:
+        warnings.append(
+            f"calibrate: the focal length is known to {numbers['focal_sigma_rel']:.1%} only; add views from other "
+            "heights and with the camera turned by 90 degrees, or photographs of a board"
+        )
+    return Result({"camera": camera}, numbers, warnings, evidence)
 
 
 def photos_of(board_photos: list[dict[str, str]], view: str) -> list[dict[str, str]]:
@@ -332,6 +357,6 @@ STAGE = Stage(
     "calibrate",
     compute,
     knobs.Calibrate,
-    inputs={"facts": FACTS, "board_photos": BOARD_PHOTOS},
+    inputs={"facts": FACTS, "board_photos": BOARD_PHOTOS, "reconstruction": RECONSTRUCTION},
     outputs={"camera": CAMERA, "view_cameras": VIEW_CAMERAS},
 )

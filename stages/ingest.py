@@ -30,7 +30,7 @@ from pipeline.image.frames import read_frame
 from pipeline.image.raw import file_sha256
 from pipeline.image.sensitivities import is_known
 from pipeline.image.sensor import missing, read_bad_pixels, restated
-from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, WISHES
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, VIEW_PHOTOS, WISHES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_latlong, read_linear, read_mask
 from pipeline.run.manifest import (
@@ -71,6 +71,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
     dumped["probe"] |= _probe_files(facts, root, manifest, problems, flaws)
+    view_photos = _view_photos(facts, root, manifest, problems, flaws)
     proxies = _proxies(facts, root, manifest, problems, warnings)
     occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
     _check_references(facts, manifest, brackets, problems)
@@ -81,6 +82,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     numbers = {
         "frames": {name: len(bracket.frames) for name, bracket in brackets.items()},
         "board_photos": len(board),
+        "view_photos": len(view_photos),
         "objects": len(wishes["object"]),
         "proxies": len(proxies),
         "occluders": len(occluders),
@@ -88,8 +90,8 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
         "camera": brackets["plate"].frames[0].camera,
     }
     outputs = {
-        "facts": dumped, "wishes": wishes, "brackets": brackets, "board_photos": board, "proxies": proxies,
-        "occluders": occluders,
+        "facts": dumped, "wishes": wishes, "brackets": brackets, "board_photos": board,
+        "view_photos": view_photos, "proxies": proxies, "occluders": occluders,
     }  # fmt: skip
     return Result(outputs, numbers, warnings)
 
@@ -124,6 +126,21 @@ def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: lis
         problems.extend(found)
         photos += [{"file": f.relative_to(root).as_posix(), "sha256": file_sha256(f), "view": view} for f in files]
     return photos
+
+
+def _view_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]) -> list[Frame]:
+    """The further photographs; exposure does not matter for them."""
+    if facts.views is None:
+        return []
+    files, found = resolve_files(facts.views.files, root, f"{manifest}: views.files")
+    problems.extend(found)
+    frames = []
+    for file in files:
+        try:
+            frames.append(read_frame(file, file.relative_to(root).as_posix()))
+        except CaptureError as error:
+            flaws.append(str(error))
+    return frames
 
 
 def _probe_files(
@@ -424,8 +441,8 @@ STAGE = Stage(
     knobs.Ingest,
     inputs={},
     outputs={
-        "facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS, "proxies": PROXIES,
-        "occluders": OCCLUDERS,
+        "facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS,
+        "view_photos": VIEW_PHOTOS, "proxies": PROXIES, "occluders": OCCLUDERS,
     },
     impure=True,
 )  # fmt: skip

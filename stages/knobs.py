@@ -41,6 +41,12 @@ class Balance(Params):
     """No knobs: the references are facts."""
 
 
+class Sfm(Params):
+    """Structure from motion over further views."""
+
+    method: Literal["incremental", "global"] = Field("incremental", description="COLMAP's mapper; global is for many")
+
+
 class Calibrate(Params):
     """Intrinsics from board photographs."""
 
@@ -129,7 +135,7 @@ class Report(Params):
 
 
 KNOBS: dict[str, type[Params]] = {
-    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "calibrate": Calibrate, "pose": Pose,
+    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sfm": Sfm, "calibrate": Calibrate, "pose": Pose,
     "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance, "render": Render,
     "composite": Composite, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip

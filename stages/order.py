@@ -8,7 +8,7 @@ import importlib
 from pipeline.run.stage import Graph
 
 NAMES = (
-    "ingest", "merge", "develop", "balance", "calibrate", "pose", "probe", "lights", "plane", "reflectance", "render",
+    "ingest", "merge", "develop", "balance", "sfm", "calibrate", "pose", "probe", "lights", "plane", "reflectance", "render",
     "composite", "evaluate", "report",
 )  # fmt: skip
 

@@ -81,7 +81,7 @@ def marker_rectangle(facts: dict[str, Any], camera_height_m: float) -> tuple[np.
         margin = board.get("margin_m", 0.0)
         return np.array([[-margin, 0, -margin], [x + margin, 0, z + margin]]), float(min(x, z) / 2)
     if facts.get("marker"):
-        half = facts["marker"]["side_m"] / 2
+        half = facts["marker"][0]["side_m"] / 2
         return np.array([[-half, 0, -half], [half, 0, half]]), float(2 * half)
     return np.empty((0, 3)), 0.1 * camera_height_m
 

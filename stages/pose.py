@@ -1,31 +1,44 @@
-"""Where every view was taken from: board, single marker, surveyed points or given, each with a 6x6 covariance.
+"""Where every view was taken from: board, marker, points, given or further views, each with a 6x6 covariance.
 
 Method: corners are measured in the photograph itself and the pose minimises their reprojection error through the lens
 (Levenberg-Marquardt, Huber search, then least squares without outliers). Both poses that a plane allows (IPPE, Collins
 and Bartoli 2014) are refined; when the second is nearly as good the view is refused with both. Surveyed points go
-through LO-RANSAC (COLMAP). Covariance: inverse normal matrix times the larger of the stated corner variance and chi2
-per degree of freedom, plus the camera's covariance carried through; corners are taken as independent.
-Views from one tripod position are tested for having stayed (chi2 of the difference) and then share one pose, estimated
-from their averaged corners. Limits: a flat board of the stated size; a wrong size scales the world unnoticed.
+through LO-RANSAC (COLMAP). Views that show no marker are oriented by what they share with further photographs: tracks
+of the cloud and markers seen in any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse
+normal matrix times the larger of the stated corner variance and chi2 per degree of freedom, plus the camera's
+covariance carried through; corners are taken as independent. Views from one tripod position are tested for having
+stayed (chi2 of the difference) and then share one pose, estimated from their averaged corners. Limits: a flat board of
+the stated size; a wrong size scales the world unnoticed.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.camera.markers import fit_marker, grey, marker_points, tone
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px, read_grey
 from pipeline.camera.resection import Resection, is_planar, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference, nearest_rotation
-from pipeline.run.artifacts import CAMERA, FACTS, PHOTOGRAPHS, VIEW_CAMERAS, VIEWS
+from pipeline.camera.sfm import Seen, oriented, scale_sigma, scaled_covariance
+from pipeline.image.colour import decode_srgb
+from pipeline.run.artifacts import (
+    CAMERA,
+    FACTS,
+    PHOTOGRAPHS,
+    RECONSTRUCTION,
+    VIEW_CAMERAS,
+    VIEW_PHOTOS,
+    VIEWS,
+)
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Raster, Result, View
+from pipeline.types import Camera, Frame, Raster, Reconstruction, Result, View
 from stages import knobs
 
 FEWEST_CORNERS = 6
@@ -48,7 +61,7 @@ class Estimate:
 
 def compute(
     facts: dict[str, Any], photographs: dict[str, Raster], camera: Camera, view_cameras: dict[str, Camera],
-    params: knobs.Pose,
+    reconstruction: Reconstruction, view_photos: list[Frame], params: knobs.Pose,
 ) -> Result:  # fmt: skip
     """``world_from_camera`` of "plate" and of every ball, and the camera of each that is not the plate's."""
     balls = {ball["name"]: bool(ball.get("tripod", False)) for ball in facts["ball"]}
@@ -64,8 +77,13 @@ def compute(
     estimates: dict[str, Estimate] = {}
     views: dict[str, View] = {}
     tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
+    asked = [name for name, order in orders.items() if order["route"] == "colmap"]
+    extra: dict[str, Any] = {}
+    if asked:
+        placed, extra = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
+        views |= placed
     for name in orders:
-        if name not in tripod:
+        if name not in tripod and name not in views:
             estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
             views[name] = view_of(estimate) if isinstance(estimate, Estimate) else estimate
             if isinstance(estimate, Estimate):
@@ -76,8 +94,10 @@ def compute(
     }
     for name, shift in shifts.items():
         numbers[name]["tripod_shift_px"] = shift
-    placed = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
-    return Result({"views": placed}, numbers, warnings, reasons(orders, views, list(cameras.values())))
+    if extra:
+        numbers["sfm"] = extra
+    result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
+    return Result({"views": result}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
 
 def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:
@@ -97,6 +117,85 @@ def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[s
     if balls.get(name):
         return {"route": "same_as", "explicit": False}
     raise ManifestError(f"view {name}: neither [board], [marker] nor a [[pose]] entry; needed one to orient it")
+
+
+def by_views(
+    facts: dict[str, Any], asked: list[str], tripod: list[str], photographs: dict[str, Raster], camera: Camera,
+    reconstruction: Reconstruction, view_photos: list[Frame], warnings: list[str],
+) -> tuple[dict[str, View], dict[str, Any]]:  # fmt: skip
+    """Poses of the views that asked for it from all photographs together, and the numbers of that adjustment."""
+    lost = [name for name in asked if name not in reconstruction.names]
+    if lost:
+        raise CaptureError(
+            f"{lost[0]}: shares too little with the further views to be oriented by them, needed common texture; "
+            "photograph [views] from nearer to it, or give it another [[pose]] route"
+        )
+    cameras = [camera, *reconstruction.cameras[1:]]
+    root = Path(facts["capture_root"])
+    files = {photo.file for photo in view_photos}
+    seen: dict[str, list[Seen]] = {}
+    for number, name in enumerate(reconstruction.names):
+        lens = cameras[reconstruction.camera_of[number]]
+        if name in files:
+            encoded = np.asarray(read_grey(root / name), np.float32) / 255
+            linear = np.asarray(decode_srgb(encoded), np.float32)
+        else:
+            linear = grey(photographs[name].rgb())
+        seen[name] = marks_in(facts, linear, lens)
+    done, markers = oriented(reconstruction, cameras, seen, None)
+    views: dict[str, View] = {}
+    scale = scale_sigma(done)
+    for number, name in enumerate(reconstruction.names):
+        if name not in asked and name not in tripod:
+            continue
+        by_lens, lens = done.by_lens[number], cameras[reconstruction.camera_of[number]]
+        mine = (done.bundle.seen_view == number) & done.used
+        views[name] = View(
+            world_from_camera=done.bundle.poses[number],
+            covariance=scaled_covariance(
+                done.pose_covariance[number] + by_lens @ lens.covariance @ by_lens.T, done.bundle.poses[number], scale
+            ), route="colmap",
+            rms_px=float(done.track_sigma_px * np.sqrt(2)), points=int(mine.sum()),
+            lens_covariance=by_lens @ lens.covariance,
+        )  # fmt: skip
+    shown = {name: len(marks) for name, marks in seen.items() if marks}
+    numbers: dict[str, Any] = {
+        "scale_sigma_rel": scale, "track_sigma_px": done.track_sigma_px, "corner_sigma_px": done.corner_sigma_px,
+        "left_out": int((~done.used).sum()), "sightings": len(done.used), "markers_seen_in": len(shown),
+        "markers_placed": len(markers),
+    }  # fmt: skip
+    for name in [name for name in tripod if name in views and "plate" in views]:
+        apart = difference(views[name].world_from_camera, views["plate"].world_from_camera)
+        at = [reconstruction.names.index(n) for n in (name, "plate")]
+        chi2 = float(apart @ np.linalg.solve(done.pose_covariance[at].sum(0), apart))
+        numbers[f"{name}_tripod_chi2"] = chi2
+        if chi2 <= MOVED_CHI2:
+            views.pop(name)  # it stayed: the plate's pose is its own
+        else:
+            warnings.append(
+                f"{name}: the tripod moved by {np.linalg.norm(apart[3:]) * 1000:.1f} mm; its own pose is used"
+            )
+    return views, numbers
+
+
+def marks_in(facts: dict[str, Any], linear: np.ndarray, camera: Camera) -> list[Seen]:
+    """The board, or the markers, seen in one photograph; those that cannot be measured are left out."""
+    pictures = [(tone(linear, curve) * 255 + 0.5).astype(np.uint8) for curve in ("gamma", "log")]
+    if facts.get("board"):
+        sights = board_sightings(pictures[0], tone(linear), facts["board"], camera)
+        return [Seen(0, sights.world_m, sights.px)] if len(sights.px) >= FEWEST_CORNERS else []
+    found = []
+    for number, marker in enumerate(facts["marker"]):
+        tries = (marker_corners_px(picture, marker["dictionary"], marker["id"])[0] for picture in pictures)
+        quads = next((quads for quads in tries if len(quads)), np.empty((0, 4, 2)))
+        if len(quads) != 1:
+            continue
+        try:
+            px = fit_marker(linear, quads[0], camera, marker_cells(marker["dictionary"]))
+        except CaptureError:
+            continue
+        found.append(Seen(number, marker_points(marker["side_m"]), px))
+    return found
 
 
 def check_sizes(photographs: dict[str, Raster], cameras: dict[str, Camera]) -> None:
@@ -127,7 +226,7 @@ def sight(facts: dict[str, Any], name: str, order: dict[str, Any], photograph: R
             if len(tries[-1].px) >= ENOUGH_OF_BOARD * total:
                 break
         return max(tries, key=lambda seen: len(seen.px))
-    marker = facts["marker"]
+    marker = facts["marker"][0]
     for curve in ("gamma", "log"):
         picture = (tone(radiance, curve) * 255 + 0.5).astype(np.uint8)
         quads, markers = marker_corners_px(picture, marker["dictionary"], marker["id"])
@@ -329,7 +428,7 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: 
     """Which pose source each view took, and why."""
     why = {
         "charuco": "the board is described", "marker": "the single marker is described", "points": "asked for",
-        "given": "asked for", "same_as": "same tripod position as the plate",
+        "given": "asked for", "same_as": "same tripod position as the plate", "colmap": "asked for",
     }  # fmt: skip
     entries = [
         {
@@ -351,6 +450,13 @@ STAGE = Stage(
     "pose",
     compute,
     knobs.Pose,
-    {"facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "view_cameras": VIEW_CAMERAS},
+    {
+        "facts": FACTS,
+        "photographs": PHOTOGRAPHS,
+        "camera": CAMERA,
+        "view_cameras": VIEW_CAMERAS,
+        "reconstruction": RECONSTRUCTION,
+        "view_photos": VIEW_PHOTOS,
+    },
     {"views": VIEWS},
 )

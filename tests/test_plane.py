@@ -122,7 +122,7 @@ def test_refusals() -> None:
 
 def test_marker_and_bare_worlds() -> None:
     params, views = knobs.Plane(), {"plate": view_of(looking_at(np.zeros(3), 40, 0, 2.0))}
-    marked = plane.compute({"board": None, "marker": {"side_m": 0.1}}, {"object": []}, CAMERA, views, params)
+    marked = plane.compute({"board": None, "marker": [{"side_m": 0.1}]}, {"object": []}, CAMERA, views, params)
     np.testing.assert_allclose(marked.numbers["rectangle_m"], [-0.85, -0.85, 0.85, 0.85])
     bare = plane.compute({"board": None, "marker": None}, {"object": []}, CAMERA, views, params)
     assert bare.numbers["rectangle_m"][2] == pytest.approx(8 * 0.1 * 2.0 * np.cos(np.radians(40)))

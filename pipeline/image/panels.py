@@ -246,7 +246,8 @@ def pose_part(build: Build) -> dict[str, Any]:
 
 def board_overlay(build: Build, view: View, board: dict[str, Any] | None) -> tuple[list[fig.Line], list[fig.Label]]:
     """The board's squares, and the world's axes at its origin."""
-    side = board["square_m"] if board else 0.5 * (build.facts.get("marker") or {}).get("side_m", 0.1)
+    markers = build.facts.get("marker") or [{"side_m": 0.1}]
+    side = board["square_m"] if board else 0.5 * markers[0]["side_m"]
     segments, camera = [], view.camera or build.camera
     if board:
         x, z = np.array(board["squares"]) * side

@@ -6,7 +6,21 @@ from typing import Any
 
 from pipeline.conventions import ACESCG, RADIANCE_UNIT
 from pipeline.run.stage import STATED, Artifact
-from pipeline.types import Balance, BallFit, Bracket, Camera, Emitter, Harmonics, Occluder, Plane, Proxy, Surface, View
+from pipeline.types import (
+    Balance,
+    BallFit,
+    Bracket,
+    Camera,
+    Emitter,
+    Frame,
+    Harmonics,
+    Occluder,
+    Plane,
+    Proxy,
+    Reconstruction,
+    Surface,
+    View,
+)
 
 FACTS = Artifact("facts", "json", "capture.toml, validated, with defaults", type=dict[str, Any])
 WISHES = Artifact("wishes", "json", "scene.toml, validated; files resolved, with their digests", type=dict[str, Any])
@@ -14,6 +28,7 @@ BRACKETS = Artifact("brackets", "json", "every RAW file by view, with its metada
 BOARD_PHOTOS = Artifact(
     "board_photos", "json", "calibration photographs: file, sha256, view they calibrate", type=list[dict[str, str]]
 )
+VIEW_PHOTOS = Artifact("view_photos", "json", "further photographs, with their metadata", type=list[Frame])
 PROXIES = Artifact("proxies", "json", "further real surfaces of the local scene: meshes, albedo", "m", type=list[Proxy])
 OCCLUDERS = Artifact("occluders", "json", "real things before the objects: meshes or masks", "m", type=list[Occluder])
 
@@ -41,6 +56,10 @@ CORRECTIONS = Artifact(
     "corrections", "cdl", "ASC CDL collection: every view's gains and their inverse; the plate made neutral, offered"
 )
 
+RECONSTRUCTION = Artifact(
+    "reconstruction", "json", "poses and cloud of all photographs in a frame of its own; empty without further views",
+    type=Reconstruction,
+)  # fmt: skip
 CAMERA = Artifact("camera", "json", "the plate's intrinsics, distortion, covariance", "px", type=Camera)
 VIEW_CAMERAS = Artifact("view_cameras", "json", "cameras of views that have their own", "px", type=dict[str, Camera])
 VIEWS = Artifact("views", "json", "pose of every view with covariance", "m, rad", type=dict[str, View])

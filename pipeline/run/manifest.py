@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
@@ -65,7 +65,7 @@ class BoardFacts(Strict):
 
 
 class MarkerFacts(Strict):
-    """A single ArUco or AprilTag marker that defines the world."""
+    """An ArUco or AprilTag marker; the first one defines the world, the places of others are found."""
 
     dictionary: str = "DICT_5X5_100"
     id: int = Field(ge=0)
@@ -79,11 +79,18 @@ class PointFacts(Strict):
     px: tuple[float, float] = Field(description="first pixel centre at (0.5, 0.5)")
 
 
+class ViewsFacts(Strict):
+    """Further photographs of the place (JPEG or RAW, one exposure each): they orient the others by what all show."""
+
+    files: list[str] = Field(min_length=1, description="files or globs")
+    own_camera: bool = Field(False, description="taken by another body, lens or focus than the plate")
+
+
 class PoseFacts(Strict):
     """How one view is oriented when not by the board."""
 
     view: str
-    route: Literal["charuco", "marker", "points", "given"]
+    route: Literal["charuco", "marker", "points", "given", "colmap"]
     points: list[PointFacts] = Field([])
     world_from_camera: Matrix4 | None = None
 
@@ -188,7 +195,8 @@ class CaptureFacts(Strict):
     ball: list[BallFacts] = Field([], description="views of the ball, for the kinds that are one")
     probe: ProbeFacts
     board: BoardFacts | None = None
-    marker: MarkerFacts | None = None
+    marker: list[MarkerFacts] = Field([], description="one [marker] table, or several [[marker]]")
+    views: ViewsFacts | None = None
     camera: CameraFacts = CameraFacts()
     pose: list[PoseFacts] = Field([])
     exposure: list[ExposureFacts] = Field([])
@@ -201,6 +209,11 @@ class CaptureFacts(Strict):
     chart: ChartFacts | None = None
     lens: LensFacts | None = None
     truth: str | None = Field(None, description="truth.json of a simulated capture, relative to this file")
+
+    @field_validator("marker", mode="before")
+    @classmethod
+    def _one_marker(cls, value: Any) -> Any:
+        return [value] if isinstance(value, dict) else value
 
     @model_validator(mode="after")
     def _consistent(self) -> CaptureFacts:
@@ -232,8 +245,13 @@ class CaptureFacts(Strict):
             given = [table.name for table in tables]
             if len(set(given)) < len(given):
                 raise ValueError(f"{kind} names are {given}; each must be unique")
-        if not self.camera.calibration and self.camera.given is None:
-            raise ValueError("camera: neither calibration photographs nor given numbers")
+        if not self.camera.calibration and self.camera.given is None and self.views is None:
+            raise ValueError("camera: neither calibration photographs, given numbers nor [views]")
+        marks = [(marker.dictionary, marker.id) for marker in self.marker]
+        if len(set(marks)) < len(marks):
+            raise ValueError(f"marker ids are {[mark[1] for mark in marks]}; each must be unique")
+        if any(pose.route == "colmap" for pose in self.pose) and self.views is None:
+            raise ValueError("pose.route colmap needs [views]: further photographs of the place")
         cameras = [self.camera, *(ball.camera for ball in self.ball if ball.camera is not None)]
         if any(camera.calibration for camera in cameras) and self.board is None:
             raise ValueError("camera.calibration needs [board]")
@@ -313,6 +331,8 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
             lines.append(f"{where}: {dotted}: unknown key" + (f"; did you mean {close[0]}?" if close else ""))
         elif item["type"] == "missing":
             lines.append(f"{where}: {dotted}: missing; it is required")
+        elif isinstance(item["input"], str) and item["input"].startswith("TODO"):  # as insitu init writes them
+            lines.append(f"{where}: {dotted}: still to be filled in: {item['input'].removeprefix('TODO').lstrip(': ')}")
         elif item["type"] == "probe_kind":
             stated = item["input"].get("kind") if isinstance(item["input"], dict) else item["input"]
             lines.append(f"{where}: probe.kind: is {stated!r}; {item['msg']}")
