@@ -351,3 +351,13 @@ def test_a_pattern_that_its_own_picture_contradicts_is_refused(tmp_path, said):
             back(path)
     grey = write_dng(tmp_path / "b.dng", (512 + light).round().astype(np.uint16), cfa=said)
     assert back(grey).shape == light.shape
+
+
+@pytest.mark.parametrize("rows", [1, 15])
+def test_rows_without_data_are_refused(tmp_path, rows):
+    """An uncompressed file whose end the card lost has all its bytes, and zeros for a picture."""
+    path = write_dng(tmp_path / "a.dng", picture() + np.uint16(400))
+    data = path.read_bytes()
+    path.write_bytes(data[: -rows * 160] + bytes(rows * 160))
+    with pytest.raises(CaptureError, match=f"{rows} of 60 rows hold nothing but 0"):
+        back(path)

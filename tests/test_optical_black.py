@@ -95,3 +95,13 @@ def test_from_a_file(tmp_path, masked):
 def test_nothing_is_measured_without_dark_photosites(tmp_path):
     path = write_dng(tmp_path / "a.dng", stored(7))
     assert read_sensor(path, read_metadata(path)).black is None
+
+
+def test_cropped_photosites_of_a_dark_scene_are_no_black():
+    """A margin that sees the same 20 DN of light as the picture beside it is not believed; one below metadata is."""
+    rng = np.random.default_rng(8)
+    dim = rng.normal(512 + 20, 5, (ACTIVE[2], ACTIVE[3])).round().astype(np.uint16)
+    assert measured(dim) is None
+    assert measured(dim, stated=535.0) is not None  # light only adds
+    masked = optical_black.measure(dim, [(13, 2, 213, 40)], ACTIVE, 15000.0, np.full((2, 2), 512.0), "MaskedAreas")
+    assert masked is not None  # the file's own word

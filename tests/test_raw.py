@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from pipeline.image.raw import file_sha256, read_metadata, read_mosaic
 from pipeline.run.errors import CaptureError
 from pipeline.simulation.dng import DngFacts, dng_bytes
 
-DATA = Path(os.environ.get("INSITU_DATA", "../shared/data"))
 MATRIX = np.array([[0.742, -0.205, -0.062], [-0.456, 1.248, 0.233], [-0.106, 0.215, 0.648]])
 
 
@@ -138,24 +136,3 @@ def test_missing_exposure_is_zero_not_invented(tmp_path):
     path = write(tmp_path / "a.dng", ramp(), exposure=Fraction(0), iso=0, fnumber=Fraction(0))
     frame = read_metadata(path)
     assert (frame.exposure_s, frame.iso, frame.fnumber) == (0, 0, 0)
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="no INSITU_DATA")
-class TestRealFiles:
-    def test_magic_lantern_dng_without_exif(self):
-        frame = read_metadata(DATA / "raw/colorchart.dng")
-        assert (frame.exposure_s, frame.iso, frame.fnumber) == (0, 0, 0)  # LibRaw says 1 s at f/1
-        assert (frame.width, frame.height, frame.white) == (1734, 1156, 15000)
-        assert read_mosaic(DATA / "raw/colorchart.dng", frame).shape == (1156, 1734)
-
-    def test_nikon_nef(self):
-        frame = read_metadata(DATA / "raw/RAW_NIKON_D1.NEF")
-        assert (frame.exposure_s, frame.iso, frame.fnumber, frame.cfa) == (0.004, 200, 7.6, "BGGR")
-        assert read_mosaic(DATA / "raw/RAW_NIKON_D1.NEF", frame).shape == (1324, 2012)
-
-    @pytest.mark.parametrize("name", ["DNG.dng", "CanonRaw.cr2", "Nikon.nef", "FujiFilm.raf", "Sigma.x3f"])
-    def test_headers_without_data_are_refused(self, name):
-        path = DATA / "raw_broken" / name
-        with pytest.raises(CaptureError) as error:
-            read_mosaic(path, read_metadata(path))
-        assert "\n" not in str(error.value)

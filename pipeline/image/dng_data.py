@@ -250,7 +250,7 @@ def _unpacked(data: bytes, layout: Layout) -> np.ndarray:
     if bits == 8:
         values = np.frombuffer(data, np.uint8)
     elif bits == 16:
-        values = np.frombuffer(data, order + "u2").astype(np.uint16)
+        values = np.frombuffer(data, order + "u2").astype(np.uint16, copy=False)
     else:
         values = imagecodecs.packints_decode(data, np.dtype("u2"), bits, runlen=columns * samples)
     values = values.reshape(-1, columns, samples)

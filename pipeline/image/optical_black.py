@@ -20,6 +20,8 @@ MIN_SAMPLES = 64  # of each CFA cell
 GUARD = 4  # photosites nearest to light and to the rim of the sensor: leaks, settling, test patterns
 MAX_SPREAD = 0.01  # standard deviation of dark photosites, of full scale; more is no dark area
 MAX_SHIFT = 0.02  # of full scale that black may differ from metadata; more is no dark area
+BESIDE = 32  # photosites of the active area next to a margin
+LEAK = 0.05
 SIGMAS = 3.0
 SMALLEST_DN = 0.05  # differences below this cost less than 4e-6 of full scale at 14 bits
 
@@ -52,17 +54,31 @@ def measure(
     """Black of the areas of a stored picture (H, W) DN; None when none of them looks dark or all are too small.
 
     ``scale``: white - black DN. An area is dark when its samples spread less than MAX_SPREAD and lie within MAX_SHIFT
-    of the ``stated`` black (2, 2). The area with the smallest standard error is used.
+    of the ``stated`` black (2, 2). The area with the smallest standard error is used. Margins, which nobody says are
+    masked, must stay dark beside light: see `_lit`.
     """
-    found = [one for area in areas if (one := _of_area(stored, area, active, source)) is not None]
+    found = [(area, one) for area in areas if (one := _of_area(stored, area, active, source)) is not None]
     dark = [
         one
-        for one in found
-        if np.all(one.noise < MAX_SPREAD * scale) and np.all(np.abs(one.level - stated) < MAX_SHIFT * scale)
+        for area, one in found
+        if np.all(one.noise < MAX_SPREAD * scale)
+        and np.all(np.abs(one.level - stated) < MAX_SHIFT * scale)
+        and not (source == "margins" and _lit(stored, area, active, one.level, stated))
     ]
     if not dark:
         return None
     return min(dark, key=lambda one: float(one.sigma.sum()))
+
+
+def _lit(stored: np.ndarray, area: Box, active: Box, level: np.ndarray, stated: np.ndarray) -> bool:
+    """Whether a margin may be ordinary photosites that were cropped: above black by more than LEAK of what is beside.
+
+    In a dark scene nobody can tell, and metadata are kept.
+    """
+    top, left, bottom, right = active
+    beside = stored[top:bottom, left : left + BESIDE] if area[3] <= left else stored[top : top + BESIDE, left:right]
+    above, light = float(np.mean(level - stated)), float(beside.mean() - level.mean())
+    return above > SMALLEST_DN and above > LEAK * max(light, 0.0)
 
 
 def _of_area(stored: np.ndarray, area: Box, active: Box, source: str) -> OpticalBlack | None:

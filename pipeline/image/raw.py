@@ -40,6 +40,7 @@ DAMAGE = (
     struct.error, AssertionError, NotImplementedError,
 )  # fmt: skip
 
+EMPTY_BELOW = 16  # DN: a row of zeros is no picture where black is above this
 MIN_SIGNAL = 0.02  # of full scale, of blocks that tell the pattern's phase
 GREENS_DIFFER = 0.05  # half their relative difference
 
@@ -149,7 +150,7 @@ def _dng_facts(name: str, path: Path, tiff: Any, pages: list[Any]) -> dict[str, 
         "lens": dng.lens_of(main),
         "vignetting": dng.vignetting_of(tags),
         "bad_pixels": defects if len(defects) else None,
-        "marks": marks,
+        "marks": list(dict.fromkeys(marks)),
     }
 
 
@@ -245,6 +246,13 @@ def _checked(samples: np.ndarray, frame: Frame) -> np.ndarray:
     low, high = samples.min(), samples.max()
     if low == high and (high < frame.white or high == 0):  # all at white is a clipped frame, which merge can tell
         raise CaptureError(f"{frame.file}: every pixel is {low:g}, so its RAW data are missing; copy it again")
+    if samples.dtype.kind == "u" and low == 0 and np.min(frame.black) > EMPTY_BELOW:
+        rows = int(np.sum(~samples.any(axis=tuple(range(1, samples.ndim)))))
+        if rows:
+            raise CaptureError(
+                f"{frame.file}: {rows} of {len(samples)} rows hold nothing but 0, black is {np.min(frame.black):g}: "
+                "data are missing; copy it again"
+            )
     return samples
 
 
