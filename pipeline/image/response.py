@@ -30,10 +30,12 @@ CLIPPED_CODE, DARK_CODE = 250 / 255, 2.5 / 255  # outside, a code says no more t
 KNOT_CODES = (2, 4, 8, 14, 22, 32, 44, 58, 74, 92, 112, 134, 156, 178, 198, 214, 228, 240, 248, 255)
 SLOPE_STEP, SLOPE_SPREAD, LEAST_SLOPE = 0.05, 1.0, 0.02  # of dh from knot to knot, against 1, and at least
 BLOCK = 4  # px
-BINS, PER_BIN = 32, 40  # flattest blocks that are kept of each frame and range of codes
+BINS, POINTS = 32, 4000  # ranges of codes, and blocks in all that are kept, evenly over them and the frames
 MAX_BLOCK_SPREAD = 0.04  # of full scale: rougher blocks have an edge in them
 LEAST_BLOCK_SIGMA = 0.1 / 255  # of a block's mean code: what compression leaves however flat it is
 EXPOSURE_SIGMA = 0.05  # of a label, relative; Cauchy tails
+DARK_SHARE = 0.2  # of the shortest frames' pixels, whose code is compared
+PEDESTAL_SIGMAS = 4.0  # above the pedestal a code means something
 ROBUST = 4.0  # sigma beyond which a block has moved (Tukey's biweight reaches zero at 1.5 times this)
 REDUNDANCY = 4.0  # blocks that say the same: three channels share most noise, neighbours share a JPEG transform
 ROUNDS = 8
@@ -57,18 +59,28 @@ class Response:
     misfit: float
     support: np.ndarray
     blocks: int
+    pedestal: np.ndarray  # (3,) code / white of no light: film base, black that was lifted; all codes here are above it
+    dark: np.ndarray  # (3,) code / white above the pedestal below which a code says no more than "at most"
+
+    def above(self, code: np.ndarray) -> np.ndarray:
+        """Codes / white (..., 3) as share of the range above the pedestal, not below 0."""
+        return np.maximum((code - self.pedestal) / (1 - self.pedestal), 0)
 
     def sigma(self) -> np.ndarray:
         """(TABLE, 3) standard uncertainty of ``log_light``."""
         return np.sqrt(np.stack([np.einsum("tk,kl,tl->t", self.basis, c, self.basis) for c in self.covariance], -1))
 
+    def steepness(self, code: np.ndarray, channel: int) -> np.ndarray:
+        """D ln L / d(code / white) of codes / white."""
+        slope = np.maximum(np.gradient(self.log_light[:, channel], _grid()), 0.1)
+        return np.interp(code, _grid(), slope)
+
     def table(self, white: float) -> np.ndarray:
         """(white + 1, 3) uint16 light of every code; below the darkest that means anything a straight line to 0."""
-        code = np.arange(round(white) + 1) / white
-        light = np.stack([np.exp(np.interp(code, _grid(), self.log_light[:, c])) for c in range(3)], -1)
-        dark = code < DARK_CODE
-        edge = np.array([np.exp(np.interp(DARK_CODE, _grid(), self.log_light[:, c])) for c in range(3)])
-        light[dark] = edge * code[dark, None] / DARK_CODE
+        code = self.above(np.repeat(np.arange(round(white) + 1)[:, None] / white, 3, 1))
+        light = np.stack([np.exp(np.interp(code[:, c], _grid(), self.log_light[:, c])) for c in range(3)], -1)
+        edge = np.array([np.exp(np.interp(self.dark[c], _grid(), self.log_light[:, c])) for c in range(3)])
+        light = np.where(code < self.dark, edge * code / self.dark, light)
         top = max(np.exp(np.interp(CLIPPED_CODE, _grid(), self.log_light[:, c])) for c in range(3))
         scaled = np.minimum(np.rint(light / top * LINEAR_WHITE), LINEAR_WHITE)
         scaled[code >= CLIPPED_CODE] = LINEAR_WHITE
@@ -89,7 +101,8 @@ def recover(views: Sequence[Sequence[np.ndarray]], labels: Sequence[Sequence[flo
 
     Without two frames of one view that show the same things the answer is the prior: sRGB, and as unsure as that is.
     """
-    blocks = [_blocks(views, white, channel) for channel in range(3)]
+    floors = [pedestal(views, labels, white, channel) for channel in range(3)]
+    blocks = [_blocks(views, white, channel, *floors[channel]) for channel in range(3)]
     logs = np.log(np.concatenate([np.asarray(label, float) for label in labels]))
     ladder = np.concatenate([np.log(label) - np.mean(np.log(label)) for label in labels])
     errors = _across(ladder)
@@ -110,8 +123,28 @@ def recover(views: Sequence[Sequence[np.ndarray]], labels: Sequence[Sequence[flo
     support = [[b.code.min(), b.code.max()] if len(b.code) else [0.5, 0.5] for b in blocks]
     return Response(
         curve - curve[-1].max(), basis, covariance, offsets, 255 * float(np.median(every)), np.array(support),
-        sum(len(np.unique(b.point)) for b in blocks),
+        sum(len(np.unique(b.point)) for b in blocks), *np.array(floors).T,
     )  # fmt: skip
+
+
+def pedestal(
+    views: Sequence[Sequence[np.ndarray]], labels: Sequence[Sequence[float]], white: float, channel: int
+) -> tuple[float, float]:
+    """Code / white of no light, and how far above it a code means something: what does not fall with the exposure.
+
+    A fifth of the two shortest frames of a view at the same code, though their exposures differ, has no light in it.
+    """
+    for stack, label in zip(views, labels):
+        order = np.argsort(label)
+        if len(order) < 2 or label[order[1]] < 1.4 * label[order[0]]:
+            continue
+        shortest, next_one = (stack[order[i]][..., channel] / white for i in (0, 1))
+        levels = [float(np.quantile(picture, DARK_SHARE)) for picture in (shortest, next_one)]
+        if abs(levels[0] - levels[1]) < 0.6 / 255 and levels[0] > DARK_CODE:
+            level = float(np.median(shortest[shortest <= 2 * levels[0]]))
+            spread = 1.4826 * float(np.median(np.abs(shortest[shortest <= 2 * levels[0]] - level)))
+            return level, max(DARK_CODE, PEDESTAL_SIGMAS * spread)
+    return 0.0, DARK_CODE
 
 
 # Basis ----------------------------------------------------------------------------------------------------------------
@@ -160,14 +193,15 @@ def _steepness(code: np.ndarray, slopes: np.ndarray) -> np.ndarray:
 # Observations ---------------------------------------------------------------------------------------------------------
 
 
-def _blocks(views: Sequence[Sequence[np.ndarray]], white: float, channel: int) -> _Blocks:
+def _blocks(views: Sequence[Sequence[np.ndarray]], white: float, channel: int, floor: float, dark: float) -> _Blocks:
     points, frames, codes = [], [], []
     first_frame, first_point = 0, 0
+    per_bin = int(np.clip(POINTS / BINS / max(1, sum(len(stack) for stack in views)), 4, 40))
     for stack in views:
-        found = [_block_means(picture[..., channel], white) for picture in stack]
+        found = [_block_means((picture[..., channel] / white - floor) / (1 - floor), dark) for picture in stack]
         mean = np.stack([m for m, _ in found])  # (F, P)
         usable = np.stack([ok for _, ok in found])
-        wanted = np.flatnonzero(_chosen(mean, usable) & (usable.sum(0) > 1))
+        wanted = np.flatnonzero(_chosen(mean, usable, per_bin) & (usable.sum(0) > 1))
         frame, point = np.nonzero(usable[:, wanted])
         points.append(point + first_point)
         frames.append(frame + first_frame)
@@ -176,25 +210,24 @@ def _blocks(views: Sequence[Sequence[np.ndarray]], white: float, channel: int) -
     return _Blocks(*(np.concatenate(parts) for parts in (points, frames, codes)))
 
 
-def _block_means(codes: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray]:
+def _block_means(codes: np.ndarray, dark: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean code / white of every block, and whether it is flat and neither clipped nor dark."""
     rows, columns = (size // BLOCK for size in codes.shape)
     cut = codes[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK)
-    low, high = cut.min((1, 3)) / white, cut.max((1, 3)) / white
-    mean = cut.mean((1, 3)) / white
-    usable = (low > DARK_CODE) & (high < CLIPPED_CODE) & (high - low < 3 * MAX_BLOCK_SPREAD)
+    low, high, mean = cut.min((1, 3)), cut.max((1, 3)), cut.mean((1, 3))
+    usable = (low > dark) & (high < CLIPPED_CODE) & (high - low < 3 * MAX_BLOCK_SPREAD)
     return mean.ravel(), usable.ravel()
 
 
-def _chosen(mean: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def _chosen(mean: np.ndarray, usable: np.ndarray, per_bin: int) -> np.ndarray:
     """(P,) bool: evenly over each frame's codes, every so many of those at hand."""
     chosen = np.zeros(mean.shape[1], bool)
     twice = usable.sum(0) > 1
     for codes, good in zip(mean, usable & twice):
-        bins = np.minimum((codes * BINS).astype(int), BINS - 1)
+        bins = np.clip((codes * BINS).astype(int), 0, BINS - 1)
         for number in range(BINS):
             members = np.flatnonzero(good & (bins == number))
-            chosen[members[:: max(1, len(members) // PER_BIN)]] = True
+            chosen[members[:: max(1, len(members) // per_bin)]] = True
     return chosen
 
 
