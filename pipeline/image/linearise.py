@@ -4,8 +4,8 @@ The curve of each camera is recovered from all of its views together (`pipeline.
 samples proportional to light, with the noise that neighbouring frames show, as if a DNG had stated it. What the curve
 does not know is no noise: it is the same in every pixel of one code, so it is added to the merged variance afterwards.
 
-A pixel of which one channel clips is not used for the others either, except in the shortest frame: the camera mixed its
-channels before it clipped the result, and hues drift there.
+Limits: the cameras mix channels before they clip the result, so hues drift close to white; one channel's clip is not
+held against the others.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ class Linearised:
     brackets: dict[str, Bracket]
     responses: dict[str, Response]
     tables: dict[str, np.ndarray]  # by file: (codes, 3) uint16
-    shortest: set[str]  # files that are the shortest of a view
     noise: dict[str, np.ndarray] = field(default_factory=dict)  # by file: (6,) shot and floor of R, G, B
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -48,10 +47,7 @@ class Linearised:
         table = self.tables.get(frame.file)
         if table is None:
             return codes
-        linear = np.stack([table[codes[..., c], c] for c in range(3)], -1)
-        if frame.file not in self.shortest:
-            linear[(linear == LINEAR_WHITE).any(-1)] = LINEAR_WHITE
-        return linear
+        return np.stack([table[codes[..., c], c] for c in range(3)], -1)
 
     def completed(self, merged: Result) -> Result:
         """Merge's result with the curves' share of the variance, and what is to be said of them."""
@@ -87,7 +83,7 @@ def linearise(brackets: dict[str, Bracket], decode: Callable[[Frame], np.ndarray
         if frames:
             frames = sorted(frames, key=lambda frame: (exposure_of(frame), frame.file))
             views.setdefault(frames[0].camera, []).append(frames)
-    result = Linearised(dict(brackets), {}, {}, {frames[0].file for group in views.values() for frames in group})
+    result = Linearised(dict(brackets), {}, {})
     for camera, group in views.items():
         codes = [[_strips(decode(frame)) * (1 / frame.white) for frame in frames] for frames in group]
         response = recover(codes, [[exposure_of(frame) for frame in frames] for frames in group], 1.0)
