@@ -22,7 +22,7 @@ CHUNK = 576  # samples that a pass settles; a multiple of 2 and 3, so that every
 MARGIN = 8  # samples that it looks at on either side: two neighbours, at a pitch of up to 3
 WINDOW = CHUNK + 2 * MARGIN  # whole vectors; a fixed number, so that loops need no remainder
 ROWS = range(0, 11 * WINDOW, WINDOW)  # beginnings in flat memory: the compiler then sees how far apart they are
-BLACK, SCALE, SHOT, FLOOR, LIMIT, POISSON, POISSON_FLOOR, BRIGHT, *UP_TO_HERE = ROWS  # of a frame's coefficients
+BLACK, SCALE, SHOT, FLOOR, LIMIT, POISSON, COUNTS, BRIGHT, *UP_TO_HERE = ROWS  # of a frame's coefficients
 ALL_TOTAL, ALL_INVERSE, ALL_FLOORS = UP_TO_HERE  # Poisson weights of this and all shorter frames
 TOP, SQUARES, TOTAL, SHOTS, FLOORS, LEVEL, CHI2, COUNT = ROWS[:8]  # of a chunk's working memory
 NONE, SOME, ALL = range(3)  # of a chunk's samples clip
@@ -47,8 +47,10 @@ def compiled(function: Callable[..., Any], *helpers: Callable[..., Any]) -> Call
 @functools.cache
 def block_kernel() -> Callable[..., None]:
     """`merge_block`, compiled."""
-    sums = (_pad, _clipping, _unclipped_first, _plain, _add_one, _add_two, _sums, _add, _add_careful, _anything_below)
-    return compiled(merge_block, *sums, _is_bright, _level, _mean, _disagreement, _raise_ghosts, _write, _bound)
+    usual = (_usual, _count_one, _count_two, _poisson_mean, _below_limit, _add_two, _optimal_mean)
+    usual = (*usual, _chi2, _chi2_one, _chi2_two, _write_usual)
+    rare = (_sums, _add, _add_careful, _anything_below, _is_bright, _mean, _disagreement, _raise_ghosts, _write, _bound)
+    return compiled(merge_block, _pad, _clipping, _unclipped_first, _rough, _level, *usual, *rare)
 
 
 def merge_block(
@@ -85,15 +87,16 @@ def merge_block(
             for f in range(frames):
                 state[f] = _clipping(samples[f, row, start:end], bounds[f])
             usual = _unclipped_first(state)
-            if usual > 0 and _plain(
-                samples, row, start + MARGIN, usual, coefficient, poisson, chi2_limits[min(2, frames)], work,
-                radiance[row, target], variance[row, target], mask[row, target],
-            ):  # fmt: skip
+            if usual > 0 and _usual(samples, row, start, usual, pitch, coefficient, poisson, work, rough):
+                _chi2(samples, row, start, usual, coefficient, work)
+                limit = chi2_limits[usual]
+                _write_usual(limit, usual, work, radiance[row, target], variance[row, target], mask[row, target])
                 continue
             odd = _sums(samples, row, start, state, coefficient, True, work)
             optimal = not poisson and not _is_bright(state, coefficient, work)
             if optimal:
-                _level(pitch, coefficient[0], work, rough)
+                _rough(coefficient[0], work, rough)
+                _level(pitch, rough, work)
                 odd = _sums(samples, row, start, state, coefficient, False, work)
             odd |= _mean(optimal, coefficient[frames - 1], chi2_limits[min(2, frames)], work)
             if odd:
@@ -148,65 +151,148 @@ def _unclipped_first(state: np.ndarray) -> int:
     return count
 
 
-def _plain(
+def _usual(
     samples: np.ndarray,
     row: int,
     start: int,
     frames: int,
+    pitch: int,
     coefficient: np.ndarray,
     poisson: bool,
-    chi2_limit: float,
     work: np.ndarray,
-    radiance: np.ndarray,
-    variance: np.ndarray,
-    mask: np.ndarray,
+    rough: np.ndarray,
 ) -> bool:
-    """Merge and write a chunk of ``frames`` unclipped frames by Poisson weights; whether that is all there is to do.
-
-    It is not when read noise matters, frames disagree, or a longer frame, which clips, lies above the mean.
-    """
-    zero, odd, end = np.float32(0), np.int32(0), start + CHUNK
-    work[:CHUNK], work[SQUARES : SQUARES + CHUNK] = zero, zero
+    """Mean and variance of a chunk of ``frames`` unclipped frames; not if a longer one, which clips, lies above it."""
+    work[:WINDOW] = np.float32(0)
+    for f in range(0, frames - 1, 2):
+        one, two = samples[f, row, start : start + WINDOW], samples[f + 1, row, start : start + WINDOW]
+        _count_two(one, two, coefficient[f], coefficient[f + 1], work)
     if frames % 2:
-        _add_one(samples[0, row, start:end], coefficient[0, MARGIN:], work)
-    for f in range(frames % 2, frames, 2):
-        one, two = samples[f, row, start:end], samples[f + 1, row, start:end]
-        _add_two(one, two, coefficient[f, MARGIN:], coefficient[f + 1, MARGIN:], work)
-    longest, brighter = coefficient[frames - 1, MARGIN:], coefficient[min(frames, len(coefficient) - 1), MARGIN:]
-    never = -np.float32(np.inf)
-    dim, below = never if poisson else zero, never if frames == len(coefficient) else zero
-    for x in range(len(radiance)):
-        top, inverse = work[TOP + x], longest[ALL_INVERSE + x]
-        mean = top * inverse
-        level = max(mean, zero)
-        spread = (level * longest[ALL_TOTAL + x] + longest[ALL_FLOORS + x]) * inverse * inverse
-        chi2 = work[SQUARES + x] - mean * top
-        floor = longest[FLOOR + x] * longest[POISSON + x]  # the least of the frames', as radiance
-        again = (chi2 > chi2_limit * (level + floor)) | (mean < longest[BRIGHT + x] + dim)
-        odd |= np.int32(again | (mean < brighter[LIMIT + x] + below))
-        radiance[x] = mean
-        variance[x] = spread
-        mask[x] = np.uint32(DARK) if mean * abs(mean) < spread else np.uint32(0)
-    return bool(odd == 0)
+        _count_one(samples[frames - 1, row, start : start + WINDOW], coefficient[frames - 1], work)
+    dim = _poisson_mean(coefficient[frames - 1], work)
+    if frames < len(coefficient) and _below_limit(coefficient[frames], work):
+        return False
+    if dim and not poisson:
+        rough[:] = work[:WINDOW]
+        _level(pitch, rough, work)
+        work[:LEVEL] = np.float32(0)
+        for f in range(0, frames - 1, 2):
+            one, two = samples[f, row, start : start + WINDOW], samples[f + 1, row, start : start + WINDOW]
+            _add_two(one, two, coefficient[f], coefficient[f + 1], work)
+        if frames % 2:
+            _add(samples[frames - 1, row, start : start + WINDOW], coefficient[frames - 1], False, work)
+        _optimal_mean(work)
+    return True
 
 
-def _add_one(dn: np.ndarray, coefficient: np.ndarray, work: np.ndarray) -> None:
-    """Add an unclipped frame to a chunk's sums of value and of squares by Poisson weights."""
-    for x in range(CHUNK):
-        value = (np.float32(dn[x]) - coefficient[BLACK + x]) * coefficient[SCALE + x]
-        weighted = coefficient[POISSON + x] * value
-        work[TOP + x] += weighted
-        work[SQUARES + x] += weighted * value
+def _count_one(dn: np.ndarray, one: np.ndarray, work: np.ndarray) -> None:
+    """Add an unclipped frame to the sum of counts."""
+    for x in range(WINDOW):
+        work[TOP + x] += (np.float32(dn[x]) - one[BLACK + x]) * one[COUNTS + x]
+
+
+def _count_two(dn: np.ndarray, dn_2: np.ndarray, one: np.ndarray, two: np.ndarray, work: np.ndarray) -> None:
+    """`_count_one` of two frames at once, which spares the memory of the sum."""
+    for x in range(WINDOW):
+        first = (np.float32(dn[x]) - one[BLACK + x]) * one[COUNTS + x]
+        work[TOP + x] += first + (np.float32(dn_2[x]) - two[BLACK + x]) * two[COUNTS + x]
+
+
+def _poisson_mean(longest: np.ndarray, work: np.ndarray) -> bool:
+    """Turn the sum of counts into mean, level and variance; whether read noise matters anywhere."""
+    dim = np.int32(0)
+    for x in range(WINDOW):
+        inverse = longest[ALL_INVERSE + x]
+        mean = work[TOP + x] * inverse
+        level = max(mean, np.float32(0))
+        work[TOP + x] = mean
+        work[LEVEL + x] = level
+        work[FLOORS + x] = (level * longest[ALL_TOTAL + x] + longest[ALL_FLOORS + x]) * inverse * inverse
+        work[CHI2 + x] = np.float32(0)
+        dim |= np.int32(mean < longest[BRIGHT + x])
+    return bool(dim > 0)
+
+
+def _below_limit(brighter: np.ndarray, work: np.ndarray) -> bool:
+    """Whether the mean lies anywhere below the limit of a frame that clips."""
+    below = np.int32(0)
+    for x in range(WINDOW):
+        below |= np.int32(work[TOP + x] < brighter[LIMIT + x])
+    return bool(below > 0)
 
 
 def _add_two(dn: np.ndarray, dn_2: np.ndarray, one: np.ndarray, two: np.ndarray, work: np.ndarray) -> None:
-    """`_add_one` for two frames at once, which spares the memory of the sums."""
-    for x in range(CHUNK):
+    """`_add` of two frames at once, with one division."""
+    for x in range(WINDOW):
         value = (np.float32(dn[x]) - one[BLACK + x]) * one[SCALE + x]
         value_2 = (np.float32(dn_2[x]) - two[BLACK + x]) * two[SCALE + x]
-        weighted, weighted_2 = one[POISSON + x] * value, two[POISSON + x] * value_2
-        work[TOP + x] += weighted + weighted_2
-        work[SQUARES + x] += weighted * value + weighted_2 * value_2
+        level = work[LEVEL + x]
+        noise = one[SHOT + x] * level + one[FLOOR + x]
+        noise_2 = two[SHOT + x] * level + two[FLOOR + x]
+        both = np.float32(1) / (noise * noise_2)
+        weight, weight_2 = both * noise_2, both * noise
+        square, square_2 = weight * weight, weight_2 * weight_2
+        work[TOP + x] += weight * value + weight_2 * value_2
+        work[TOTAL + x] += weight + weight_2
+        work[SHOTS + x] += square * one[SHOT + x] + square_2 * two[SHOT + x]
+        work[FLOORS + x] += square * one[FLOOR + x] + square_2 * two[FLOOR + x]
+
+
+def _optimal_mean(work: np.ndarray) -> None:
+    """Turn the weighted sums into mean, level and variance."""
+    for x in range(WINDOW):
+        inverse = np.float32(1) / work[TOTAL + x]
+        mean = work[TOP + x] * inverse
+        level = max(mean, np.float32(0))
+        work[TOP + x] = mean
+        work[LEVEL + x] = level
+        work[FLOORS + x] = (level * work[SHOTS + x] + work[FLOORS + x]) * inverse * inverse
+
+
+def _chi2(samples: np.ndarray, row: int, start: int, frames: int, coefficient: np.ndarray, work: np.ndarray) -> None:
+    """Chi-square of unclipped frames about their mean, two by two."""
+    for f in range(0, frames - 1, 2):
+        one, two = samples[f, row, start : start + WINDOW], samples[f + 1, row, start : start + WINDOW]
+        _chi2_two(one, two, coefficient[f], coefficient[f + 1], work)
+    if frames % 2:
+        _chi2_one(samples[frames - 1, row, start : start + WINDOW], coefficient[frames - 1], work)
+
+
+def _chi2_one(dn: np.ndarray, one: np.ndarray, work: np.ndarray) -> None:
+    """Add how far an unclipped frame lies from the mean."""
+    slack = np.float32(RATIO_ERROR**2)
+    for x in range(WINDOW):
+        level = work[LEVEL + x]
+        misfit = (np.float32(dn[x]) - one[BLACK + x]) * one[SCALE + x] - work[TOP + x]
+        work[CHI2 + x] += misfit * misfit / (one[SHOT + x] * level + one[FLOOR + x] + slack * level * level)
+
+
+def _chi2_two(dn: np.ndarray, dn_2: np.ndarray, one: np.ndarray, two: np.ndarray, work: np.ndarray) -> None:
+    """`_chi2_one` of two frames at once, with one division."""
+    slack = np.float32(RATIO_ERROR**2)
+    for x in range(WINDOW):
+        level, mean = work[LEVEL + x], work[TOP + x]
+        misfit = (np.float32(dn[x]) - one[BLACK + x]) * one[SCALE + x] - mean
+        misfit_2 = (np.float32(dn_2[x]) - two[BLACK + x]) * two[SCALE + x] - mean
+        extra = slack * level * level
+        noise = one[SHOT + x] * level + one[FLOOR + x] + extra
+        noise_2 = two[SHOT + x] * level + two[FLOOR + x] + extra
+        work[CHI2 + x] += (misfit * misfit * noise_2 + misfit_2 * misfit_2 * noise) / (noise * noise_2)
+
+
+def _write_usual(
+    chi2_limit: float, frames: int, work: np.ndarray, radiance: np.ndarray, variance: np.ndarray, mask: np.ndarray
+) -> None:
+    """Write a chunk in which every sample of ``frames`` frames counts."""
+    chunk, freedom = work[MARGIN:], np.float32(1 / max(frames - 1, 1))
+    for x in range(len(radiance)):
+        mean, spread, chi2 = chunk[TOP + x], chunk[FLOORS + x], chunk[CHI2 + x]
+        ghost = chi2 > chi2_limit
+        spread = spread * chi2 * freedom if ghost else spread
+        radiance[x] = mean
+        variance[x] = spread
+        bits = np.uint32(GHOST) if ghost else np.uint32(0)
+        mask[x] = bits | (np.uint32(DARK) if mean * abs(mean) < spread else np.uint32(0))
 
 
 def _sums(
@@ -235,11 +321,12 @@ def _add(dn: np.ndarray, coefficient: np.ndarray, poisson: bool, work: np.ndarra
     if poisson:
         for x in range(WINDOW):
             value = (np.float32(dn[x]) - coefficient[BLACK + x]) * coefficient[SCALE + x]
-            weighted = coefficient[POISSON + x] * value
+            weight = coefficient[POISSON + x]
+            weighted = weight * value
             work[TOP + x] += weighted
             work[SQUARES + x] += weighted * value
-            work[TOTAL + x] += coefficient[POISSON + x]
-            work[FLOORS + x] += coefficient[POISSON_FLOOR + x]
+            work[TOTAL + x] += weight
+            work[FLOORS + x] += weight * weight * coefficient[FLOOR + x]
     else:
         for x in range(WINDOW):
             value = (np.float32(dn[x]) - coefficient[BLACK + x]) * coefficient[SCALE + x]
@@ -300,12 +387,17 @@ def _is_bright(state: np.ndarray, coefficient: np.ndarray, work: np.ndarray) -> 
     return dim == 0
 
 
-def _level(pitch: int, shortest: np.ndarray, work: np.ndarray, rough: np.ndarray) -> None:
-    """Mean radiance of the four neighbours of each sample of a chunk, itself left out; not below zero."""
+def _rough(shortest: np.ndarray, work: np.ndarray, rough: np.ndarray) -> None:
+    """Radiance by Poisson weights; the limit of the shortest frame where all clip."""
     for x in range(WINDOW):
         total = work[TOTAL + x]
         rough[x] = work[TOP + x] / total if total > np.float32(0) else shortest[LIMIT + x]
-        work[LEVEL + x] = max(rough[x], np.float32(0))
+
+
+def _level(pitch: int, rough: np.ndarray, work: np.ndarray) -> None:
+    """Mean radiance of the four neighbours of each sample of a chunk, itself left out; not below zero."""
+    for x in range(WINDOW):
+        work[LEVEL + x] = max(rough[x], np.float32(0))  # of the margins
     far_west, west = rough[MARGIN - 2 * pitch :], rough[MARGIN - pitch :]
     east, far_east = rough[MARGIN + pitch :], rough[MARGIN + 2 * pitch :]
     level = work[LEVEL + MARGIN :]

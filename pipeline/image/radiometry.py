@@ -168,10 +168,11 @@ def _coefficients(frames: Sequence[Exposed]) -> np.ndarray:
         g, black, limit = frame.exposure, frame.black, frame.limit
         shot, floor = np.maximum(frame.noise.shot, LEAST_SHOT), np.maximum(frame.noise.floor, LEAST_FLOOR)
         bright = merge_kernel.BRIGHT_RATIO * floor / (shot * g)
-        cells = [black, 1 / ((frame.white - black) * g), shot / g, floor / g**2, limit / g, g / shot, floor / shot**2]
+        dn = 1 / ((frame.white - black) * g)
+        cells = [black, dn, shot / g, floor / g**2, limit / g, g / shot, dn * g / shot]
         rows.append([_along_rows(cell, frame.mosaic.shape) for cell in (*cells, bright)])
     each = np.array(rows)  # (F, 8, 2, WINDOW)
-    total, floors = np.cumsum(each[:, 5], 0), np.cumsum(each[:, 6], 0)
+    total, floors = np.cumsum(each[:, 5], 0), np.cumsum(each[:, 5] ** 2 * each[:, 3], 0)
     whole = np.concatenate([each, np.stack([total, 1 / total, floors], 1)], 1)
     return np.ascontiguousarray(np.moveaxis(whole, 2, 0).reshape(2, len(frames), -1), np.float32)
 
