@@ -314,7 +314,7 @@ def _warn_extremes(view: str, numbers: dict[str, Any], warnings: list[str]) -> N
 
 
 def _exposure_row(frame: Frame, one: Exposed, exposures: Exposures, index: int) -> dict[str, Any]:
-    """What is written of one frame; ``nominal_s``: the time that its label means."""
+    """What is written of one frame; ``nominal_s``: the time that its labels mean, the f-number's rounding folded in."""
     limit = np.ravel(one.limit * (one.white - one.black) + one.black)
     clipped = [np.mean(plane >= level) for plane, level in zip(planes(one.mosaic), limit)]
     factor = float(exposures.values[index] / exposure.exposure_of(frame))
