@@ -153,6 +153,8 @@ def lensfun_gain(
     camera: str, lens: str, focal_mm: float, fnumber: float, height: int, width: int
 ) -> tuple[np.ndarray, str] | None:
     """(H, W) float32 gain and the lens as lensfun names it; None unless camera, lens and its vignetting are there."""
+    if not camera or not lens or not focal_mm > 0 or not fnumber > 0:
+        return None
     import lensfunpy
 
     database = lensfunpy.Database()
@@ -161,7 +163,7 @@ def lensfun_gain(
         for body in database.cameras
         if camera.lower() in (body.model.lower(), f"{body.maker} {body.model}".lower())
     ]
-    if not bodies or not lens or not focal_mm > 0 or not fnumber > 0:
+    if not bodies:
         return None
     found = sorted(database.find_lenses(bodies[0], None, lens), key=lambda one: -one.score)
     found = [one for one in found if one.min_focal * 0.95 <= focal_mm <= one.max_focal * 1.05]
@@ -172,7 +174,7 @@ def lensfun_gain(
     picture = np.ones((height, width, 3), np.float32)
     if not modifier.apply_color_modification(picture):
         return None
-    return np.ascontiguousarray(picture[..., 1]), f"{found[0].maker} {found[0].model}"
+    return np.ascontiguousarray(picture[..., 1]), found[0].model
 
 
 class Losses:
