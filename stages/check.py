@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from pipeline.camera.board_families import Layout
 from pipeline.capture import checks
-from pipeline.capture.balls import find_ball
+from pipeline.capture.balls import find_ball, outermost
 from pipeline.capture.checks import Finding
 from pipeline.capture.likeness import cells_of, relative_exposures
 from pipeline.capture.measures import (
@@ -35,7 +35,7 @@ from pipeline.capture.measures import (
 )
 from pipeline.capture.photographs import Photo, combined, files_of, read_all
 from pipeline.capture.proposal import filled
-from pipeline.capture.roles import Proposal, Shot, markers_in, propose, with_ball, with_markers
+from pipeline.capture.roles import Proposal, Shot, against_plate, markers_in, propose, with_ball, with_markers
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.manifest import CaptureFacts, load_toml, problems_of, resolve_files
 from pipeline.types import Camera
@@ -98,22 +98,27 @@ def stated(where: Path) -> Checked:
     except ValidationError as error:
         raise ManifestError(*problems_of(error, path, CaptureFacts)) from error
     root = (path.parent / os.path.expandvars(facts.root)).resolve()
+    problems: list[str] = []
     flaws: list[str] = []
 
     def shot(name: str, role: str, patterns: list[str], **more: Any) -> Shot | None:
-        files, problems = resolve_files([p for p in patterns if not p.startswith("TODO")], root, f"{path}: {name}")
+        files, missing = resolve_files([p for p in patterns if not p.startswith("TODO")], root, f"{path}: {name}")
+        problems.extend(missing)
         photos, unread = read_all(files, root)
-        flaws.extend([*problems, *unread.values()])
+        flaws.extend(unread.values())
         return bracket(name, role, photos, **more) if photos else None
 
     plate = shot("plate", "plate", facts.plate.files)
     balls = [shot(b.name, "ball", b.files, tripod=b.tripod) for b in facts.ball]
-    boards = boards_of(facts.camera.calibration, root, flaws)
+    boards = boards_of(facts.camera.calibration, root, problems, flaws)
+    if problems:
+        raise ManifestError(*problems)
     listed = [s for s in (plate, *balls) if s is not None]
     marked, layout = with_markers([*listed, *boards])
     listed = [sighted(s) if s.role == "ball" else s for s in marked]
+    plate = next((s for s in listed if s.role == "plate"), None)
     return Checked(
-        next((s for s in listed if s.role == "plate"), None), [s for s in listed if s.role == "ball"],
+        plate, [against_plate(s, plate) if plate is not None else s for s in listed if s.role == "ball"],
         [s for s in listed if s.role == "calibration"], layout,
         frozenset(b.name for b in facts.ball if b.camera is not None), bool(facts.reference),
         facts.camera.given is not None, frozenset(p.view for p in facts.pose), tuple(flaws),
@@ -130,11 +135,12 @@ def bracket(name: str, role: str, photos: list[Photo], **more: Any) -> Shot:
     return Shot(photos, cells, *combined(photos, relative_exposures(photos, cells)), role=role, name=name, **more)
 
 
-def boards_of(patterns: list[str], root: Path, flaws: list[str]) -> list[Shot]:
+def boards_of(patterns: list[str], root: Path, problems: list[str], flaws: list[str]) -> list[Shot]:
     """Every board photograph as a bracket of its own."""
-    files, problems = resolve_files(patterns, root, "camera.calibration")
+    files, missing = resolve_files(patterns, root, "camera.calibration")
+    problems.extend(missing)
     photos, unread = read_all(files, root)
-    flaws.extend([*problems, *unread.values()])
+    flaws.extend(unread.values())
     return [bracket("calibration", "calibration", [photo]) for photo in photos]
 
 
@@ -143,7 +149,7 @@ def sighted(shot: Shot) -> Shot:
     seen = find_ball(shot.light, shot.first.step, shot.first.frame.focal_35mm)
     if seen is None or not seen.is_ball:
         return replace(shot, unsure=[*shot.unsure, "no ball is found"])
-    return with_ball(shot, seen)
+    return with_ball(shot, outermost(seen, shot.light, shot.first.step, None, shot.first.frame.focal_35mm))
 
 
 def judge(capture: Checked) -> list[Finding]:
@@ -151,7 +157,7 @@ def judge(capture: Checked) -> list[Finding]:
     plates = [capture.plate] if capture.plate is not None else []
     findings = checks.present({"plate": len(plates), "ball": len(capture.balls)})
     findings += checks.no_board("board", capture.layout is not None, bool(capture.posed))
-    findings += [Finding(check="unread", severity="problem", where="files", text=flaw) for flaw in capture.flaws]
+    findings += [checks.unread(flaw) for flaw in capture.flaws]
     lens, found = judge_lens(capture)
     for shot in [*plates, *capture.balls]:
         findings += judge_bracket(shot)

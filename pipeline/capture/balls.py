@@ -6,7 +6,7 @@ dishes and knots have one too; that the brightest spot of the picture lies withi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ RADIUS_M = 0.05  # any: without the scale only the angle counts
 EACH = 2  # places per size that are looked at closer
 MERIT, MERIT_WITH_LAMP, MERIT_SURE, LAMP_STOPS = 0.65, 0.45, 0.55, 1.5  # measured: see find_ball
 LEAST_VISIBLE = 0.5
+LEAST_GROWN, MOST_GROWN, NEARLY = 0.95, 1.6, 0.85  # sizes about a found outline, and share of the best merit
 
 
 @dataclass(frozen=True)
@@ -63,18 +64,49 @@ def find_ball(light: np.ndarray, step: int, focal_35mm: float = 0.0) -> BallSeen
     """
     camera = assumed_camera(light.shape, focal_35mm)
     signals = finding.signals_of(raster_of(light), None)
-    found = []
-    for place in seeds.search_anywhere(signals, camera, RADIUS_M, EACH):
-        centre, _, _ = seeds.settle(signals, camera, RADIUS_M, place, None)
-        share, even = seeds.coverage(signals, camera, centre, RADIUS_M)
-        size = radius_in_pixels(camera, centre, RADIUS_M)
-        x, y = project(camera, centre[None])[0]
-        lamp = lamp_stops(light, float(x), float(y), size)
-        visible = fraction_in_frame(camera, centre, RADIUS_M)
-        seen = BallSeen(float(x) * step, float(y) * step, size * step, (share - even) / (1 - even), lamp, visible)
-        if visible >= LEAST_VISIBLE:
-            found.append((seen.merit * np.sqrt(min(size, 100.0)) + 0.5 * float(np.clip(lamp, 0, 4)), seen))
-    return max(found, key=lambda entry: entry[0])[1] if found else None
+    places = seeds.search_anywhere(signals, camera, RADIUS_M, EACH)
+    found = [seen for place in places if (seen := settled(light, signals, camera, place, step)) is not None]
+    return max(found, key=lambda seen: rank(seen, step), default=None)
+
+
+def rank(seen: BallSeen, step: int) -> float:
+    """How much speaks for an outline: azimuths in excess of chance, in its spread, and stops of its lamps."""
+    return seen.merit * float(np.sqrt(min(seen.radius / step, 100.0))) + 0.5 * float(np.clip(seen.lamp_stops, 0, 4))
+
+
+def settled(
+    light: np.ndarray, signals: list[np.ndarray], camera: Camera, place: np.ndarray, step: int
+) -> BallSeen | None:
+    """The outline near a place (3,) that gets most votes; None when most of it is out of the frame."""
+    centre, _, _ = seeds.settle(signals, camera, RADIUS_M, place, None)
+    visible = fraction_in_frame(camera, centre, RADIUS_M)
+    if visible < LEAST_VISIBLE:
+        return None
+    share, even = seeds.coverage(signals, camera, centre, RADIUS_M)
+    size = radius_in_pixels(camera, centre, RADIUS_M)
+    x, y = (float(value) for value in project(camera, centre[None])[0])
+    lamp = lamp_stops(light, x, y, size)
+    return BallSeen(x * step, y * step, size * step, (share - even) / (1 - even), lamp, visible)
+
+
+def outermost(
+    seen: BallSeen, light: np.ndarray, step: int, behind: np.ndarray | None = None, focal_35mm: float = 0.0
+) -> BallSeen:
+    """The largest outline about a found one that is seen nearly as well: what a ball mirrors has round edges too.
+
+    ``behind`` (h, w, 3): the same view without the ball, whose difference ends at the rim.
+    """
+    camera = assumed_camera(light.shape, focal_35mm)
+    signals = finding.signals_of(raster_of(light), None if behind is None else raster_of(behind))
+    best, found = seen, [seen]
+    for place in seeds.search_anywhere(signals, camera, RADIUS_M, 3, (seen.x / step, seen.y / step)):
+        if LEAST_GROWN < radius_in_pixels(camera, place, RADIUS_M) * step / seen.radius < MOST_GROWN:
+            other = settled(light, signals, camera, place, step)
+            if other is not None and np.hypot(other.x - seen.x, other.y - seen.y) < 0.5 * other.radius:
+                found.append(other)
+                best = max(best, other, key=lambda one: one.merit)
+    largest = max((one for one in found if one.merit >= NEARLY * best.merit), key=lambda one: one.radius)
+    return replace(largest, merit=best.merit)  # that there is a ball is as sure as the best of its outlines
 
 
 def lamp_stops(light: np.ndarray, x: float, y: float, radius: float) -> float:

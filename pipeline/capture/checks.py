@@ -292,6 +292,12 @@ def drifted(where: str, drift: Drift) -> list[Finding]:
     return found or [Finding(check="drift", severity="ok", where=where, text=text)]
 
 
+def unread(flaw: str) -> Finding:
+    """A photograph that cannot be read, as its reader says."""
+    take = "it again, unless the card still has it whole"
+    return Finding(check="unread", severity="problem", where="files", text=flaw, take=take)
+
+
 def present(counts: Mapping[str, int]) -> list[Finding]:
     """Whether plate and ball are there at all."""
     take = {

@@ -20,7 +20,7 @@ from pipeline.capture.photographs import Photo
 CELLS = 160  # along the longer side
 BINS = 16  # of the tone curve
 LEAST_CELLS = 150  # well exposed in both, to tell anything
-GLANCE = 0.35  # likeness of every ninth cell below which two views are others
+GLANCE = 0.2  # likeness of every ninth cell below which two views are others
 LEAST_RANGE = 0.05  # robust spread of ln light below which a picture is blank
 MAX_CELL_SIGMA = 0.12  # of ln light, of cells that are compared
 DEVIATION, SIGMAS = 0.12, 5.0  # a cell is changed beyond both

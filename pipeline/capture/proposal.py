@@ -51,6 +51,7 @@ def text_of(proposal: Proposal, name: str, root: str = ".") -> str:
     size = next(((s.first.frame.width, s.first.frame.height) for s in [*plates, *balls] or proposal.shots), (0, 0))
     lines += ["", *board_lines(proposal.layout), "", *camera_lines(proposal, everything, size)]
     lines += chart_lines([(name, shot) for name, shot in zip(["plate", *names], [*plates[:1], *balls])])
+    lines += views_lines(proposal.of("views"), everything)
     lines += exposure_lines([photo for shot in [*plates, *balls] for photo in shot.photos])
     lines += left_lines(proposal, known)
     return "\n".join(lines) + "\n"
@@ -198,6 +199,16 @@ def camera_lines(proposal: Proposal, everything: Sequence[str], size: tuple[int,
         "[camera]",
         given(*size),
     ]
+
+
+def views_lines(views: Sequence[Shot], everything: Sequence[str]) -> list[str]:
+    """The [views] table: photographs of the place by the plate's camera, neither plate nor ball nor board alone."""
+    photos = [photo for shot in views for photo in shot.photos]
+    if not photos:
+        return []
+    boards = sum(shot.markers is not None and len(shot.markers.ids) > 1 for shot in views)
+    lines = comment(f"Further views: {len(photos)} of the plate's size, {boards} of them show the board from afar.")
+    return ["", *lines, "[views]", f"files = {listing(photos, everything)}"]
 
 
 def chart_lines(views: Sequence[tuple[str, Shot]]) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.camera.board_families import FAMILIES, Layout, Markers, find_markers, layout_of
 from pipeline.camera.markers import tone
-from pipeline.capture.balls import BallSeen, find_ball, raster_of
+from pipeline.capture.balls import BallSeen, find_ball, outermost, raster_of
 from pipeline.capture.grouping import Grouping, compare_all, group, repeats
 from pipeline.capture.likeness import Cells, Likeness, cells_of, compare_moved, relative_exposures
 from pipeline.capture.photographs import Photo, combined
@@ -38,7 +38,7 @@ class Shot:
     clipped: np.ndarray  # (h, w) in the shortest frame, and so in all
     markers: Markers | None = None
     ball: BallSeen | None = None
-    role: str = "left"  # ball, plate, calibration, view or left
+    role: str = "left"  # ball, plate, calibration, views (of the place), view (other), crop or left
     name: str = ""
     tripod: bool = False
     chart: np.ndarray | None = None  # (4, 2) corners px of a 24-patch chart
@@ -150,7 +150,7 @@ def with_balls(shots: list[Shot]) -> list[Shot]:
             if seen is None or (several is singles and seen.lamp_stops < SINGLE_LAMP_STOPS):
                 continue
             if seen.is_ball:
-                found[id(shot)] = seen
+                found[id(shot)] = outermost(seen, shot.light, shot.first.step, None, shot.first.frame.focal_35mm)
         if found:
             break
     return [with_ball(shot, found[id(shot)]) if id(shot) in found else shot for shot in shots]
@@ -223,7 +223,7 @@ def with_plate(shots: list[Shot]) -> list[Shot]:
         if shot is plate:
             shot = replace(shot, role="plate", because=[*shot.because, *reasons], unsure=[*shot.unsure, *unsure])
         elif shot.role == "ball":
-            shot = with_tripod(shot, alike(plate, shot))
+            shot = against_plate(with_tripod(shot, alike(plate, shot)), plate)
         found.append(shot)
     return found
 
@@ -239,6 +239,15 @@ def with_tripod(ball: Shot, like: Likeness | None) -> Shot:
     return replace(ball, because=[*ball.because, "another view than the plate's"])
 
 
+def against_plate(ball: Shot, plate: Shot) -> Shot:
+    """A tripod's ball with its outline measured on what differs from the plate."""
+    if not ball.tripod or ball.ball is None or ball.light.shape != plate.light.shape:
+        return ball
+    return replace(
+        ball, ball=outermost(ball.ball, ball.light, ball.first.step, plate.light, ball.first.frame.focal_35mm)
+    )
+
+
 def with_boards(shots: list[Shot], layout: Layout | None) -> list[Shot]:
     """Photographs of the board by the plate's camera, and what is left as further views."""
     plates = [s for s in shots if s.role == "plate"] or [s for s in shots if s.role == "ball"]
@@ -248,7 +257,7 @@ def with_boards(shots: list[Shot], layout: Layout | None) -> list[Shot]:
     for shot in shots:
         frame = shot.first.frame
         if shot.role == "left" and layout is not None and markers_in(shot) >= 4 and area(shot) >= BOARD_AREA:
-            own = size is None or (frame.width, frame.height) == size
+            own = size is None or own_size(shot, size)
             known = {frame.camera, camera} - {""}
             if own and len(known) < 2:
                 text = f"{markers_in(shot)} markers over {area(shot):.0%} of the frame"
@@ -262,9 +271,15 @@ def with_boards(shots: list[Shot], layout: Layout | None) -> list[Shot]:
             markers_in(shot) >= FEW_MARKERS or (size and (frame.width, frame.height) == size)
         ):
             board = f", shows {markers_in(shot)} markers" if markers_in(shot) else ""
-            shot = replace(shot, role="view", because=[f"a further view{board}"])
+            of_place = own_size(shot, size) and (markers_in(shot) >= FEW_MARKERS or frame.camera == camera != "")
+            shot = replace(shot, role="views" if of_place else "view", because=[f"a further view{board}"])
         found.append(shot)
     return found
+
+
+def own_size(shot: Shot, size: tuple[int, int] | None) -> bool:
+    """Whether a bracket's photographs are of this size."""
+    return (shot.first.frame.width, shot.first.frame.height) == size
 
 
 def with_chart(shot: Shot) -> Shot:
