@@ -294,3 +294,11 @@ def test_listed_defects_are_replaced_and_flagged():
         assert np.all((variance > 0) & (variance < 0.01))
         assert np.count_nonzero(mask) == 3 * (1 if len(shape) == 2 else 3)
     assert defects.replace_listed(radiance, variance, mask, np.zeros((0, 2), int)) == 0
+
+
+def test_floating_point_is_not_rounded_to_its_white():
+    """White 1.0 is no single step: the floor of a usual sensor is its read noise, and not a twelfth."""
+    counted = noise.assumed(frame())
+    floating = noise.assumed(frame().model_copy(update={"white": 1.0, "black": np.zeros((2, 2))}))
+    rounding = (1 / noise.full_scale(frame()) ** 2 - 1 / 65535**2) / 12
+    np.testing.assert_allclose(floating.floor, counted.floor - rounding, rtol=1e-9)

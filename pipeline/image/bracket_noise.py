@@ -165,7 +165,7 @@ class _Pair:
         found = exposure.measure_ratio(a.ravel()[few], b.ravel()[few], label, BELOW_KNEE * limit, rough)
         if found is None:
             found = exposure.measure_ratio(a.ravel(), b.ravel(), label, limit, rough)
-        step = 1 / noise.full_scale(frames[0])
+        step = 1 / noise.steps(frames[0])
         return None if found is None else cls(keys, a, b, float(np.exp(found[0])), limit, step)
 
     def bins(self) -> list[photon_transfer.Bin]:

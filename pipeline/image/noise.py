@@ -71,6 +71,11 @@ def full_scale(frame: Frame) -> float:
     return frame.white - float(np.mean(frame.black))
 
 
+def steps(frame: Frame) -> float:
+    """Steps of quantisation from black to white. Floating-point data, whose white lies below 255, count as 16 bits."""
+    return full_scale(frame) if frame.white >= 255 else 65535.0
+
+
 def _uniform(frame: Frame, shot: float, floor: float, source: str, **more: float) -> Noise:
     return Noise(np.full(frame.black.shape, shot), np.full(frame.black.shape, floor), source, **more)
 
@@ -83,7 +88,7 @@ def from_profile(frame: Frame) -> Noise | None:
     pairs = profile.reshape(-1, 2)
     colours = frame.cfa or "RGB"
     cells = np.array([0 if len(pairs) == 1 else "RGB".index(colour) for colour in colours]).reshape(frame.black.shape)
-    quantisation = 1 / (12 * full_scale(frame) ** 2)
+    quantisation = 1 / (12 * steps(frame) ** 2)
     return Noise(pairs[cells, 0], np.maximum(pairs[cells, 1], quantisation), "NoiseProfile", *PROFILE_SIGMA)
 
 
@@ -94,7 +99,7 @@ def from_facts(frame: Frame, tables: Sequence[Mapping[str, Any]]) -> Noise | Non
             scale = full_scale(frame)
             electrons = table["electrons_at_white"] or table["electrons_per_dn"] * scale
             read = (table["read_noise_electrons"] / electrons) ** 2
-            floor = read + 1 / (12 * scale**2)
+            floor = read + 1 / (12 * steps(frame) ** 2)
             sigmas = {"shot_sigma": table["gain_sigma_rel"], "floor_sigma": 2 * table["read_noise_sigma_rel"]}
             pattern = {"prnu": table["prnu"] or 0.0, "prnu_sigma": table["prnu_sigma_rel"] if table["prnu"] else 0.0}
             return _uniform(frame, 1 / electrons, floor, "given", **sigmas, **pattern)
@@ -104,7 +109,7 @@ def from_facts(frame: Frame, tables: Sequence[Mapping[str, Any]]) -> Noise | Non
 def assumed(frame: Frame) -> Noise:
     """A usual sensor at a frame's ISO, for want of anything better."""
     shot = frame.iso / 100 / ASSUMED_ELECTRONS
-    floor = (ASSUMED_READ_ELECTRONS * shot) ** 2 + 1 / (12 * full_scale(frame) ** 2)
+    floor = (ASSUMED_READ_ELECTRONS * shot) ** 2 + 1 / (12 * steps(frame) ** 2)
     return _uniform(frame, shot, floor, "assumed", shot_sigma=ASSUMED_SIGMA, floor_sigma=2 * ASSUMED_SIGMA)
 
 
