@@ -182,7 +182,9 @@ def write_dng(
         if main is None:
             ifd0, ifd1 = directory([*{e[0]: e for e in [*link, *here]}.values()], 8, order), b""
         else:
-            preview = [(254, LONG, 1), (256, LONG, 1), (257, LONG, 1), (330, LONG, raw_at)]
+            here_first = {entry[0] for entry in first.values()}
+            preview = [e for e in ((254, LONG, 1), (256, LONG, 1), (257, LONG, 1)) if e[0] not in here_first]
+            preview.append((330, LONG, raw_at))
             ifd0, ifd1 = directory([*link, *preview], 8, order), directory(here, raw_at, order)
         return ifd0, ifd1, directory(exif, exif_at, order)
 

@@ -361,3 +361,12 @@ def test_rows_without_data_are_refused(tmp_path, rows):
     path.write_bytes(data[: -rows * 160] + bytes(rows * 160))
     with pytest.raises(CaptureError, match=f"{rows} of 60 rows hold nothing but 0"):
         back(path)
+
+
+def test_a_second_picture_is_pointed_at(tmp_path):
+    """Sensor shift and bursts put several into one file."""
+    more = [(262, SHORT, 32803), (254, LONG, 0), (256, LONG, 8), (257, LONG, 8)]
+    path = write_dng(tmp_path / "a.dng", picture(), main=more)
+    frame = read_metadata(path)
+    assert frame.marks == ["holds 2 pictures of sensor data; the first of the largest is read"]
+    np.testing.assert_array_equal(read_mosaic(path, frame), picture())

@@ -185,3 +185,15 @@ def test_a_file_changed_after_ingest_is_refused(tmp_path):
     write_dng(path, np.arange(4800, dtype=np.uint16).reshape(60, 80), extra=[(50829, LONG, (0, 0, 60, 70))])
     with pytest.raises(CaptureError, match="70 x 60, metadata say 80 x 60"):
         read_mosaic(path, frame)
+
+
+@real
+@pytest.mark.parametrize("name", ["colorchart.dng", "RAW_NIKON_D1.NEF", "RAW_KODAK_DC50.KDC"])
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.99])
+def test_truncated_real_files_are_refused(tmp_path, name, share):
+    data = (DATA / "raw" / name).read_bytes()
+    path = tmp_path / name
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CaptureError) as error:
+        read_metadata(path)
+    assert "\n" not in str(error.value)

@@ -40,13 +40,15 @@ class Opcode:
     data: bytes
 
 
+def raw_pages(pages: list[Any]) -> list[Any]:
+    """Directories that hold sensor data of full size: no previews, masks or enhanced versions."""
+    kinds = (CFA_PHOTOMETRIC, LINEAR_RAW_PHOTOMETRIC)
+    return [page for page in pages if whole(t := tags_of(page), 262, 0) in kinds and whole(t, 254, 0) == 0]
+
+
 def raw_page(name: str, pages: list[Any]) -> Any:
     """The largest directory that holds sensor data of full size. Raises CaptureError where none does."""
-    raws = []
-    for page in pages:
-        tags = tags_of(page)
-        if whole(tags, 262, 0) in (CFA_PHOTOMETRIC, LINEAR_RAW_PHOTOMETRIC) and whole(tags, 254, 0) == 0:
-            raws.append(page)
+    raws = raw_pages(pages)
     if not raws:
         raise CaptureError(f"{name}: holds no sensor data, needed a mosaic or linear DNG; give the camera's own file")
     return max(raws, key=lambda page: whole(tags_of(page), 256, 0) * whole(tags_of(page), 257, 0))

@@ -143,6 +143,8 @@ def _dng_facts(name: str, path: Path, tiff: Any, pages: list[Any]) -> dict[str, 
         dng.phone_maker(main), file.kind == "linear", dng.semantic_masks(pages), 52525 in main, 50940 in main
     )
     marks += [libraw.XTRANS_MARK] * (file.kind == "xtrans")
+    if (pictures := len(dng.raw_pages(pages))) > 1:
+        marks.append(f"holds {pictures} pictures of sensor data; the first of the largest is read")
     defects = dng.listed_defects(tags)
     return {
         **colour,
