@@ -78,7 +78,8 @@ def accuracy(folder: Path, shuffled: bool = False) -> list[dict[str, Any]]:
         best = row["optimal"]
         say(
             f"   {row['electrons'][0]:10.0f} electrons, {count / 1e6:.0f} Mpx: bias {100 * best['bias']:+.3f} "
-            f"+- {100 * best['bias_se']:.3f} %, RMSE {best['rmse_over_crb']:.4f} +- {best['rmse_over_crb_se']:.4f} x bound"
+            f"+- {100 * best['bias_se']:.3f} %, "
+            f"RMSE {best['rmse_over_crb']:.4f} x bound +- {best['rmse_over_crb_se']:.4f}"
         )
     return rows
 

@@ -68,10 +68,11 @@ def merge_block(
     """Radiance, variance, mask (h, S) of ``samples`` (F, h, ...) DN, frames from the shortest, rows from ``first`` on.
 
     ``samples``: rows in the middle of `padded_rows`, whose ends are filled here. ``pitch``: samples from one to the
-    next of the same colour. ``coefficients`` (2, F, 8 * WINDOW) float32 of even and odd rows: black [DN]; then in units
-    of radiance: 1 DN, shot noise (variance over radiance), floor (variance), linear limit; 1 / shot, floor / shot^2,
-    and the radiance from which read noise does not matter. ``chi2_limits`` (F + 1,): of as many frames. Samples that
-    are NaN are left out.
+    next of the same colour. ``coefficients`` (2, F, 11 * WINDOW) float32 of even and odd rows: black [DN]; then in
+    units of radiance: 1 DN, shot noise (variance over radiance), floor (variance), linear limit; 1 / shot, 1 DN over
+    shot, the radiance from which read noise does not matter, and sums over the frames up to here. ``bounds`` (F, 2): DN
+    below which nothing clips, and from which on all does. ``chi2_limits`` (F + 1,): of as many frames. Samples that are
+    NaN are left out.
     """
     frames, (height, width) = len(samples), radiance.shape
     work = np.zeros(8 * WINDOW, np.float32)
