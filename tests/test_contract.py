@@ -31,6 +31,7 @@ BRIDGES = {
     "cv2": {
         "pipeline/camera/board_families.py",
         "pipeline/camera/opencv_bridge.py",
+        "pipeline/image/alignment.py",
         "pipeline/image/chart_finder.py",
         "pipeline/image/jpeg.py",
         "pipeline/light/sampling.py",

@@ -48,9 +48,9 @@ def compiled(function: Callable[..., Any], *helpers: Callable[..., Any]) -> Call
 def block_kernel() -> Callable[..., None]:
     """`merge_block`, compiled."""
     usual = (_usual, _count_one, _count_two, _poisson_mean, _below_limit, _add_two, _optimal_mean)
-    usual = (*usual, _chi2, _chi2_one, _chi2_two, _write_usual)
+    write = (_chi2, _chi2_one, _chi2_two, _write_usual)
     rare = (_sums, _add, _add_careful, _anything_below, _is_bright, _mean, _disagreement, _raise_ghosts, _write, _bound)
-    return compiled(merge_block, _pad, _clipping, _unclipped_first, _rough, _level, *usual, *rare)
+    return compiled(merge_block, _pad, _clipping, _unclipped_first, _rough, _level, *usual, *write, *rare)
 
 
 def merge_block(

@@ -1,0 +1,99 @@
+"""Alignment of frames: shifts measured within their uncertainty, nothing touched without need, refusals in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.image import alignment, radiometry
+from pipeline.image.noise import Noise
+from pipeline.image.radiometry import Exposed
+from pipeline.run.errors import CaptureError
+
+WHITE, BLACK, SHOT = 15800.0, 512.0, 1 / 30000
+NAMES = ["a.dng", "b.dng", "c.dng"]
+
+
+def scene(dx: float = 0.0, dy: float = 0.0, turn: float = 0.0) -> np.ndarray:
+    """(300, 420) radiance of smooth structure whose content lies (dx, dy) px off, turned about the middle."""
+    y, x = np.mgrid[:300, :420].astype(float)
+    x, y = x - dx, y - dy
+    u, v = x - 210, y - 150
+    x, y = 210 + u * np.cos(turn) - v * np.sin(turn), 150 + u * np.sin(turn) + v * np.cos(turn)
+    waves = np.sin(x / 7 + np.sin(y / 13)) + np.sin(y / 9 + x / 31) + 0.7 * np.sin((x - y) / 5) + np.sin(x * y / 4000)
+    return 0.3 + 0.06 * waves
+
+
+def photograph(radiance: np.ndarray, exposure: float, seed: int) -> Exposed:
+    random = np.random.default_rng(seed)
+    signal = random.poisson(np.maximum(radiance, 0) * exposure / SHOT) * SHOT + 1e-4 * random.standard_normal(
+        radiance.shape
+    )
+    mosaic = np.clip(np.rint(signal * (WHITE - BLACK) + BLACK), 0, WHITE).astype(np.uint16)
+    cell = (2, 2) if radiance.ndim == 2 else (1, 3)
+    noise = Noise(np.full(cell, SHOT), np.full(cell, 1.1e-8), "given")
+    return Exposed(mosaic, exposure, np.full(cell, BLACK), WHITE, np.full(cell, 0.998), noise)
+
+
+def bracket(places: list[tuple[float, float]]) -> list[Exposed]:
+    return [photograph(scene(*place), g, i) for i, (g, place) in enumerate(zip((0.25, 0.5, 1.0), places, strict=True))]
+
+
+@pytest.mark.parametrize("place", [(0, 0), (0.3, -0.2), (1.7, 0.9), (-6.4, 3.1), (9.0, -8.0)])
+def test_shift_is_measured(place):
+    found = alignment.measure(photograph(scene(), 0.5, 1), photograph(scene(*place), 1.0, 2))
+    assert found is not None
+    # the gradient is a central difference of 2 px cells: 3 % of the fractional part, beside the noise
+    assert abs(found.dx - place[0]) < 0.06 + 5 * found.sigma
+    assert abs(found.dy - place[1]) < 0.06 + 5 * found.sigma
+    assert found.sigma < 0.05
+
+
+def test_frames_that_stand_still_are_not_touched():
+    frames = bracket([(0, 0), (0.1, 0), (0, 0.2)])
+    same, evidence = alignment.align(frames, NAMES)
+    assert all(one is other for one, other in zip(same, frames, strict=True))
+    assert evidence[0]["modelled"] is False
+
+
+def test_mosaic_is_moved_by_whole_cells_exactly():
+    frames = bracket([(0, 0), (0, 0), (0, 0)])
+    far = frames[2].mosaic.copy()
+    far = np.roll(far, (4, -6), (0, 1))
+    moved, evidence = alignment.align([*frames[:2], replace(frames[2], mosaic=far)], NAMES)
+    assert evidence[0]["modelled"] is True
+    inner = (slice(10, -10), slice(10, -10))
+    np.testing.assert_array_equal(moved[2].mosaic[inner], frames[2].mosaic[inner])
+    assert moved[0] is frames[0]
+    assert np.all(np.isfinite(radiometry.merge(moved).radiance))
+
+
+def test_data_without_mosaic_are_moved_by_fractions():
+    colours = np.array([1.0, 0.8, 0.6])
+    places = [(0, 0), (0, 0), (1.6, -2.3)]
+    frames = [
+        photograph(scene(*place)[..., None] * colours, g, i)
+        for i, (g, place) in enumerate(zip((0.25, 0.5, 1.0), places, strict=True))
+    ]
+    moved, evidence = alignment.align(frames, NAMES)
+    assert evidence[0]["modelled"] is True
+    left = alignment.measure(moved[1], moved[2])
+    assert left is not None
+    assert left.length < 0.1
+
+
+def test_large_motion_and_rotation_are_refused():
+    with pytest.raises(CaptureError, match=r"b\.dng, c\.dng: frames are shifted by .* use a tripod"):
+        alignment.align(bracket([(0, 0), (0, 0), (19, 12)]), NAMES)
+    turned = [photograph(scene(), 0.5, 1), photograph(scene(1.5, 0, turn=0.02), 1.0, 2)]
+    with pytest.raises(CaptureError, match="quadrants disagree"):
+        alignment.align(turned, NAMES)
+
+
+def test_without_structure_nothing_is_said_to_be_known():
+    frames = [photograph(np.full((200, 200), 0.2), g, i) for i, g in enumerate((0.5, 1.0))]
+    same, evidence = alignment.align(frames, NAMES[:2])
+    assert same[0] is frames[0]
+    assert "no structure" in evidence[0]["because"]
