@@ -38,7 +38,7 @@ MODEL_REL = 1e-3  # of the radiance: no model of the light is better than this
 # What the sectors have in common that the sandwich cannot see, in blurs: a common inset, and a drift to one side.
 # Measured over simulated balls by `benchmarks.probe_fit.coverage`. A drift evens out over the outline less when the
 # frame shows only a part of it: with the part as divisor 29 of 30 balls cut to 40 to 57 % held 95 %, else 23.
-INSET_BLURS, DRIFT_BLURS = 0.53, 0.53
+INSET_BLURS, DRIFT_BLURS = 0.65, 0.58
 
 
 @dataclass(frozen=True)
