@@ -67,7 +67,7 @@ def check(where: Path, as_json: bool, say: Callable[[str], None]) -> int:
         for finding in findings:
             say(finding.line())
         counts = {level: sum(f.severity == level for f in findings) for level in order}
-        say(f"{counts['problem']} problems, {counts['advice']} pieces of advice, {counts['ok']} checks passed")
+        say(f"problems: {counts['problem']}, advice: {counts['advice']}, passed: {counts['ok']}")
     return 3 if any(finding.severity == "problem" for finding in findings) else 0
 
 

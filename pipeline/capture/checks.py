@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.capture.measures import SNR, Drift, Lamps
+from pipeline.capture.measures import MOST_STOPS, SNR, Drift, Lamps
 from pipeline.types import Frame, Record
 
 RADIUS_ASKED_PX, RADIUS_NEEDED_PX = 100.0, 40.0
@@ -55,14 +55,15 @@ def clipped_lights(where: str, lamps: Lamps, frame: Frame, ball: bool) -> Findin
     check = "clipped_lights"
     if lamps.share == 0:
         return Finding(check=check, severity="ok", where=where, text="the shortest frame clips nothing")
-    stops = max(1, int(np.ceil(lamps.stops)))
-    bound = "at least " if lamps.stops >= 8 else "about "
+    told = lamps.stops < MOST_STOPS
+    stops = max(1, int(np.ceil(lamps.stops))) if told else 2
+    over = f"is over by about {stops} EV" if told else "has sharp edges, which do not tell by how much it is over"
     text = (
         f"the shortest frame ({shutter(frame.exposure_s) if frame.exposure_s else 'time not stated'}) clips "
-        f"{lamps.share:.3%} of {'the ball' if ball else 'the picture'}, a spot {lamps.width_px:.0f} px wide is over by "
-        f"{bound}{stops} EV"
+        f"{lamps.share:.3%} of {'the ball' if ball else 'the picture'}; a spot {lamps.width_px:.0f} px wide {over}"
     )
     take = f"the same view {stops} EV darker" if not frame.exposure_s else next_shorter(frame, stops)
+    take += "" if told else f", and so on by {stops} EV until nothing clips"
     severity: Literal["advice", "problem"] = "problem" if ball else "advice"
     return Finding(check=check, severity=severity, where=where, text=text, take=take)
 
