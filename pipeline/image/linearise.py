@@ -228,7 +228,7 @@ def _report(result: Linearised, camera: str, response: Response, frames: list[Fr
     said = f"recovered to {sigma:.1%}" if known else f"not to be recovered (no two frames overlap): sRGB, {sigma:.0%}"
     result.warnings.append(
         f"{name}: {len(frames)} display-encoded photographs (no RAW), their curve {said}; RAW of the same bracket is "
-        "5 to 10 times more accurate (docs/capture.md)"
+        "3 to 4 times more accurate per pixel and has no such error in common (docs/capture.md)"
     )
     if known and sigma > WEAK_SIGMA:
         result.warnings.append(f"{name}: the curve is known to {sigma:.0%} only; add frames about 1 EV apart")

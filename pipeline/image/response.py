@@ -33,7 +33,7 @@ BLOCK = 4  # px
 BINS, POINTS = 32, 4000  # ranges of codes, and blocks in all that are kept, evenly over them and the frames
 MAX_BLOCK_SPREAD = 0.04  # of full scale: rougher blocks have an edge in them
 LEAST_BLOCK_SIGMA = 0.1 / 255  # of a block's mean code: what compression leaves however flat it is
-EXPOSURE_SIGMA = 0.05  # of a label, relative; Cauchy tails
+EXPOSURE_SIGMA = 0.05  # of a label, relative
 DARK_SHARE = 0.2  # of the shortest frames' pixels, whose code is compared
 PEDESTAL_SIGMAS = 4.0  # above the pedestal a code means something
 ROBUST = 4.0  # sigma beyond which a block has moved (Tukey's biweight reaches zero at 1.5 times this)
@@ -172,6 +172,8 @@ def _design(code: np.ndarray) -> np.ndarray:
     """(N, K): d ln L / d slope_k; K slopes of 1 make h the identity, up to a constant."""
     from scipy.interpolate import BSpline
 
+    if not len(code):
+        return np.zeros((0, _size()))
     knots = _knots()
     splines = BSpline.design_matrix(np.clip(_abscissa(code), knots[0], knots[-1]), knots, 3).toarray()
     greville = (knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3
@@ -268,7 +270,7 @@ def _step(
     size, count = _size(), errors.shape[1]
     total = 3 * size + count
     start = np.concatenate([slopes.ravel(), errors.T @ offsets])
-    prior, wanted = _prior(offsets, errors)
+    prior, wanted = _prior(errors)
     normal, right = prior.copy(), wanted.copy()
     for channel, (b, s, w) in enumerate(zip(blocks, sigma, weight)):
         design, steepness = _design(b.code), _steepness(b.code, slopes[channel])
@@ -303,7 +305,7 @@ def _step(
     return found[: 3 * size].reshape(3, size), errors @ found[3 * size :], np.stack([covariance[p, p] for p in parts])
 
 
-def _prior(last: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _prior(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix and right side of what is known beforehand of slopes and offsets."""
     size = _size()
     total = 3 * size + errors.shape[1]
@@ -313,8 +315,8 @@ def _prior(last: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray
         part = slice(channel * size, (channel + 1) * size)
         normal[part, part] = steps.T @ steps + np.eye(size) / (size * SLOPE_SPREAD**2)
         right[part] = 1 / (size * SLOPE_SPREAD**2)
-    certain = 1 / EXPOSURE_SIGMA**2 / (1 + (last / EXPOSURE_SIGMA) ** 2)
-    normal[3 * size :, 3 * size :] = errors.T @ (certain[:, None] * errors)
+    # no heavy tails: one frame far off would buy a power of the curve for all the others
+    normal[3 * size :, 3 * size :] = errors.T @ errors / EXPOSURE_SIGMA**2
     return normal, right
 
 
