@@ -9,7 +9,7 @@ to the variance. The equations and their sources: pipeline/image, from bracket_n
 radiometry.py on.
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
-Limits: frames of a view are not aligned; their shift is measured and reported. Views that neither stand where the
+Limits: frames of a view are moved whole when they lie a pixel apart, else left; what turns is refused. Views that neither stand where the
 plate was taken from nor share body and exposure setting with a view that is tied to it are scaled by their labels.
 """
 
@@ -19,8 +19,7 @@ import json
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -29,6 +28,7 @@ import numpy as np
 
 from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
 from pipeline.image import (
+    alignment,
     bracket_exposure,
     bracket_noise,
     defects,
@@ -54,7 +54,7 @@ from stages import knobs
 
 HELD_BYTES = 2**30  # of decoded photographs kept between their statistics and their merge; the others are read again
 NUMBER_SAMPLES = 4_000_000  # of a view, for its middle and its range
-SHIFT_WARNING_PX = 0.5
+SHIFT_WARNING_PX = 0.5  # more than this, and no more than what is mended, is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +113,12 @@ def merge_brackets(
     merged: dict[str, Merged] = {}
     numbers: dict[str, Any] = {}
     listing: dict[str, list[dict[str, Any]]] = {}
-    shifts: dict[str, float] = {}
+    aligned: dict[str, tuple[float, dict[str, Any]]] = {}
     for view in brackets:
         members = [i for i, name in enumerate(views) if name == view]
         exposed = [photographs.exposed(i, sensor, exposures) for i in members]
-        _note_shift(view, exposed, shifts)
+        exposed, shift, said = alignment.align(exposed, [frames[i].file for i in members])
+        aligned[view] = (shift or 0.0, said)
         listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
         merged[view] = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
         exposed.clear()
@@ -132,8 +133,8 @@ def merge_brackets(
         numbers[view]["prnu_at_most"] = pattern.prnu * (1 + 3 * pattern.sigma * pattern.believed)
     rasters = {view: raster_of(one, frames[views.index(view)], profiles[view]) for view, one in merged.items()}
     totals = {"noise": sensor.numbers, **exposures.numbers, "optical_black": photographs.black_numbers}
-    totals |= {"shift_px": max(shifts.values(), default=0.0)}
-    evidence = _evidence(sensor, exposures, shifts, numbers, patterns, warnings)
+    totals |= {"shift_px": max((shift for shift, _ in aligned.values()), default=0.0)}
+    evidence = _evidence(sensor, exposures, aligned, numbers, patterns, warnings)
     return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
 
 
@@ -331,36 +332,20 @@ def _exposure_row(frame: Frame, one: Exposed, exposures: Exposures, index: int) 
     }
 
 
-def _note_shift(view: str, exposed: Sequence[Exposed], shifts: dict[str, float]) -> None:
-    """Largest measured shift [px] between neighbouring frames of a view; views without structure are left out."""
-    for short, long in pairwise(exposed):
-        shift = radiometry.measure_shift(_one_plane(long), _one_plane(short))
-        if shift is not None:
-            shifts[view] = max(shifts.get(view, 0.0), shift)
-
-
-def _one_plane(one: Exposed) -> Exposed:
-    """The frame, or its green channel as (H, W) if it has three."""
-    if one.mosaic.ndim == 2:
-        return one
-    black, limit, shot, floor = (
-        np.full((2, 2), values[0, 1]) for values in (one.black, one.limit, one.noise.shot, one.noise.floor)
-    )
-    model = replace(one.noise, shot=shot, floor=floor)
-    return Exposed(one.mosaic[..., 1], one.exposure, black, one.white, limit, model)
-
-
 def _evidence(
     sensor: Sensor,
     exposures: Exposures,
-    shifts: dict[str, float],
+    aligned: Mapping[str, tuple[float, dict[str, Any]]],
     numbers: dict[str, Any],
     patterns: Mapping[str, FixedPattern],
     warnings: list[str],
 ) -> list[dict[str, Any]]:
-    moved = max(shifts.values(), default=0.0)
-    if moved > SHIFT_WARNING_PX:
-        warnings.append(f"frames of a view are shifted by up to {moved:.2f} px and are not aligned; use a tripod")
+    for view, (shift, said) in aligned.items():
+        if said["modelled"]:
+            warnings.append(f"{view}: frames lay up to {shift:.2f} px apart and were moved; use a tripod")
+        elif shift > SHIFT_WARNING_PX:
+            warnings.append(f"{view}: frames are shifted by up to {shift:.2f} px and are not aligned; use a tripod")
+    worst = max(aligned.values(), key=lambda one: (one[1]["modelled"], one[0]), default=None)
     ghosts = max((n["ghost_fraction"] for n in numbers.values()), default=0.0)
     sources = sorted({model.source for model in sensor.models})
     knees = sorted({one["linear_to"] for one in sensor.numbers.values() if "linear_to" in one})
@@ -387,14 +372,7 @@ def _evidence(
             "between plate and ball",
             "could_cost": "up to 7 % between parts of the range that different frames cover",
         },
-        {
-            "term": "alignment of frames",
-            "modelled": False,
-            "because": f"largest shift between neighbouring frames {moved:.3f} px"
-            if shifts
-            else "no structure to measure it",
-            "could_cost": f"blur of {moved:.3f} px",
-        },
+        *([] if worst is None else [worst[1]]),
         {
             "term": "motion between frames",
             "modelled": False,

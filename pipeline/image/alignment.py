@@ -42,8 +42,8 @@ class Shift:
         return float(np.hypot(self.dx, self.dy))
 
 
-def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed], list[dict[str, Any]]]:
-    """Frames of a view, moved onto the one of middle exposure where they lie off it; and the evidence.
+def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed], float | None, dict[str, Any]]:
+    """Frames of a view, moved onto the one of middle exposure where they lie off it; largest shift [px]; evidence.
 
     What a moved frame does not show at its edges is NaN. Raises CaptureError when the motion is too large or no shift.
     """
@@ -58,15 +58,15 @@ def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed
             _refuse(shift, f"{names[before]}, {names[after]}", frames[after].mosaic.shape[1])
     known = [shift for shift in shifts if shift is not None]
     if not known:
-        return list(frames), [_evidence(False, "no structure to measure a shift by", "blur")]
+        return list(frames), None, _evidence(False, "no structure to measure a shift by", "blur")
     sigma = max(shift.sigma for shift in known)
     largest = float(np.hypot(*places.T).max())
     said = f"largest shift {largest:.3f} +- {sigma:.3f} px, quadrants within {max(s.quadrants for s in known):.2f} px"
     if largest < max(LEAST_PX, LEAST_SIGMAS * sigma):
-        return list(frames), [_evidence(False, said, f"blur of {largest:.3f} px")]
+        return list(frames), largest, _evidence(False, said, f"blur of {largest:.3f} px")
     moved = [_moved(frame, *place) for frame, place in zip(frames, places, strict=True)]
     left = "up to a pixel and what turned" if frames[0].mosaic.ndim == 2 else "noise of moved frames is smoothed"
-    return moved, [_evidence(True, said, left)]
+    return moved, largest, _evidence(True, said, left)
 
 
 def _evidence(modelled: bool, because: str, could_cost: str) -> dict[str, Any]:
