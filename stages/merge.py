@@ -9,8 +9,9 @@ to the variance. The equations and their sources: pipeline/image, from bracket_n
 radiometry.py on.
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
-Limits: frames of a view are moved whole when they lie a pixel apart, else left; what turns is refused. Views that neither stand where the
-plate was taken from nor share body and exposure setting with a view that is tied to it are scaled by their labels.
+Limits: frames of a view are moved whole when they lie a pixel apart, else left; what turns is refused. Views that
+neither stand where the plate was taken from nor share body and exposure setting with a view that is tied to it are
+scaled by their labels.
 """
 
 from __future__ import annotations

@@ -85,9 +85,9 @@ def test_close_to_the_cramer_rao_bound():
             variance = g * radiance / ELECTRONS + MODEL.floor[0, 0]
             information += np.where(g * radiance < 1, g * g / variance, 0)
         ratios.append(np.sqrt(np.mean((merged.radiance - radiance) ** 2 * information)))
-    # 40 000 samples know an RMSE to 0.35 %; bins with a clip level lose the samples within two sigma of it
-    assert np.median(ratios) < 1.01
-    assert max(ratios) < 1.05
+    # 40 000 samples know an RMSE to 0.35 %; make bench-merge has 2 million in each and finds at most 1.004
+    assert np.median(ratios) < 1.003
+    assert max(ratios) < 1.004 + 4 * 0.0035
 
 
 def test_variance_is_honest():
@@ -219,15 +219,87 @@ def test_clip_level_below_white_is_found_only_when_frames_share_it():
     np.testing.assert_array_equal(alone, WHITE)
 
 
-def test_shift_between_frames():
-    y, x = np.mgrid[:200, :240]
+def test_three_channels_are_merged_each_as_a_mosaic_of_its_own():
+    """(H, W, 3) data and the three (H, W) pictures agree to what neighbours of another pitch change in the weights."""
+    radiance = np.geomspace(1e-3, 250, 40 * 700).reshape(40, 700)
+    black, limit = np.array([[512.0, 530, 490]]), np.array([[0.998, 0.99, 0.985]])
+    model = Noise(np.array([[1.0, 1.3, 0.8]]) / ELECTRONS, np.array([[1.0, 2, 3]]) * 1e-8, "given")
+    random, frames = np.random.default_rng(4), []
+    for g in STOPS:
+        signal = random.poisson(np.clip(radiance[..., None] * g, 0, 4) / model.shot) * model.shot
+        signal = signal + np.sqrt(model.floor) * random.standard_normal(signal.shape)
+        mosaic = np.clip(np.rint(signal * (WHITE - black) + black), 0, WHITE).astype(np.uint16)
+        frames.append(Exposed(mosaic, g, black, WHITE, limit, model))
+    merged = merge(frames)
+    for c in range(3):
+        cell = [np.full((2, 2), part[0, c]) for part in (black, limit, model.shot, model.floor)]
+        alone = merge(
+            [
+                Exposed(f.mosaic[..., c], f.exposure, cell[0], WHITE, cell[1], Noise(cell[2], cell[3], "given"))
+                for f in frames
+            ]
+        )
+        pull = (merged.radiance[..., c] - radiance) / np.sqrt(merged.variance[..., c])
+        assert np.std(pull) == pytest.approx(1, abs=0.02)  # 28 000 pulls: 0.4 %
+        apart = np.abs(merged.radiance[..., c] - alone.radiance) / np.sqrt(alone.variance)
+        assert np.median(apart) < 0.02
+        assert np.mean((merged.mask[..., c] ^ alone.mask) > 0) < 0.01
 
-    def scene(dx: float) -> np.ndarray:
-        return 0.2 + 0.1 * np.sin((x - dx) / 11) + 0.05 * np.sin((x - dx) / 7 + y / 5)
 
-    still = radiometry.measure_shift(photograph(scene(0), 1.0, 1), photograph(scene(0), 0.25, 2))
-    moved = radiometry.measure_shift(photograph(scene(0), 1.0, 1), photograph(scene(1.0), 0.25, 2))
-    assert still is not None
-    assert still < 0.05  # noise of 48 000 samples on gradients of 1 %/px
-    assert moved == pytest.approx(1.0, abs=0.1)
-    assert radiometry.measure_shift(photograph(np.zeros((64, 64)), 1, 1), photograph(np.zeros((64, 64)), 1, 2)) is None
+def test_machine_code_is_the_source():
+    """The compiled kernel and the same lines run by Python give the same bytes."""
+    from pipeline.image import merge_kernel
+
+    frames = bracket(np.geomspace(2e-4, 300, 3 * 700).reshape(3, 700))
+    compiled = merge(frames)
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
+        patch.setattr(merge_kernel, "block_kernel", lambda: merge_kernel.merge_block)
+        plain = merge(frames)
+    for name in ("radiance", "variance", "mask"):
+        assert getattr(compiled, name).tobytes() == getattr(plain, name).tobytes()
+
+
+def test_against_plain_arithmetic_of_double_precision():
+    """Unclipped frames far above read noise: counts over times, to float32."""
+    frames = bracket(np.geomspace(0.1, 0.9, 20 * 640).reshape(20, 640))
+    counts = sum((f.mosaic.astype(float) - BLACK) * STEP for f in frames)
+    np.testing.assert_allclose(merge(frames).radiance, counts / sum(STOPS), rtol=1e-6)
+
+
+def test_frames_are_asked_for_by_rows(tmp_path):
+    frames, asked = bracket(np.geomspace(1e-3, 200, 100 * 50).reshape(100, 50)), []
+
+    class Rows:
+        def __init__(self, mosaic):
+            self.mosaic, self.shape, self.dtype = mosaic, mosaic.shape, mosaic.dtype
+
+        def __getitem__(self, rows):
+            asked.append(rows.stop - rows.start)
+            return self.mosaic[rows]
+
+    lazy = [Exposed(Rows(f.mosaic), f.exposure, f.black, f.white, f.limit, f.noise) for f in frames]
+    assert merge(lazy).radiance.tobytes() == merge(frames).radiance.tobytes()
+    assert max(asked) <= radiometry.TILE_ROWS
+    assert sum(asked) == 100 * len(frames)
+
+
+def test_no_bias_about_a_clip_level_in_texture():
+    """Each pixel within three sigma of a clip, its neighbours far from it: below 0.15 sigma of the clipping frame."""
+    sigma = 1 / np.sqrt(ELECTRONS)
+    random = np.random.default_rng(11)
+    for offset in (-1.0, 0.0, 1.0):
+        radiance = np.exp(random.uniform(-3, 3, (1000, 1000)))
+        site = np.zeros(radiance.shape, bool)
+        site[::3, ::3] = True
+        radiance[site] = LIMIT[0, 0] * (1 + offset * sigma)  # of the longest frame
+        merged = merge(bracket(radiance, seed=21 + int(offset)), workers=2)
+        error = merged.radiance[site] / radiance[site] - 1
+        assert abs(error.mean()) < (0.15 + 4 / np.sqrt(site.sum())) * sigma
+
+
+def test_a_light_seen_only_by_a_clipped_frame_is_a_ghost():
+    frames = bracket(np.full((32, 64), 0.05))
+    frames[4].mosaic[10:14, 20:24] = int(WHITE)
+    merged = merge(frames)
+    assert np.all(merged.mask[10:14, 20:24] & GHOST)
+    np.testing.assert_allclose(merged.radiance[10:14, 20:24], 0.05, rtol=0.3)  # and the value is the others'
