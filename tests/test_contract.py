@@ -44,10 +44,12 @@ BRIDGES = {
         "pipeline/transport/caustics.py",
         "pipeline/transport/difference.py",
         "pipeline/transport/directions.py",
+        "pipeline/transport/energy.py",
         "pipeline/transport/gradient.py",
         "pipeline/transport/materials.py",
         "pipeline/transport/paths.py",
         "pipeline/transport/trace.py",
+        "pipeline/transport/variant.py",  # after mitsuba has chosen its LLVM
         "pipeline/simulation/photograph.py",
         "pipeline/simulation/twin_world.py",
     },

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.conventions import invert_rigid
 from pipeline.run.errors import NumericalError
+from pipeline.run.formats import write_png
 from pipeline.types import Camera, Reconstruction
 
 LARGEST_SIDE_PX = 2400  # features are found on pictures at most this large
@@ -110,10 +111,8 @@ def _quiet() -> None:
 
 
 def _write(pictures: dict[str, np.ndarray], files: dict[str, str], folder: Path) -> None:
-    from PIL import Image
-
     for name, picture in pictures.items():
-        Image.fromarray(np.ascontiguousarray(picture)).save(folder / files[name], compress_level=1)
+        write_png(folder / files[name], picture)
 
 
 def _extract(database: Path, folder: Path, files: list[str], camera: Camera, threads: int) -> None:
