@@ -11,6 +11,7 @@ meta.json and writes LIBRARY.npy and LIBRARY.json.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -78,7 +79,7 @@ def _colour_hdri(frames: np.ndarray, meta: dict[str, Any]) -> np.ndarray:
 def _hdrutils(frames: np.ndarray, meta: dict[str, Any]) -> np.ndarray:
     import colour_demosaicing
 
-    module = sys.modules["HDRutils.merge"]
+    module = importlib.import_module("HDRutils.merge")  # whose name is also that of a function in it
     merged: list[np.ndarray] = []
 
     def keep(mosaic: np.ndarray, pattern: str) -> np.ndarray:
