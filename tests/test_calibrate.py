@@ -15,7 +15,7 @@ from pipeline.camera.lens import project
 from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.rigid import camera_points
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
-from pipeline.types import Camera
+from pipeline.types import Camera, Reconstruction
 from stages import calibrate, knobs
 
 TRUTH = Camera(
@@ -55,7 +55,9 @@ def run(monkeypatch: pytest.MonkeyPatch, corners: list[np.ndarray], sizes: list[
         lambda grey, _, board: Sightings(POINTS[: len(corners[grey[0, 0]])], corners[grey[0, 0]], np.arange(24), 17),
     )  # fmt: skip
     facts = {"capture_root": ".", "board": BOARD, "camera": {"calibration": ["*.jpg"], "given": None}}
-    return calibrate.compute(facts, [{"file": f"{i}.jpg"} for i in range(len(corners))], knobs.Calibrate())
+    return calibrate.compute(
+        facts, [{"file": f"{i}.jpg"} for i in range(len(corners))], Reconstruction(), knobs.Calibrate()
+    )
 
 
 def test_lens_and_model_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +153,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_given_camera() -> None:
     given = {"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "distortion": [0.1]}
-    result = calibrate.compute({"camera": {"given": given}}, [], knobs.Calibrate())
+    result = calibrate.compute({"camera": {"given": given}}, [], Reconstruction(), knobs.Calibrate())
     camera = result.outputs["camera"]
     assert camera.source == "given"
     np.testing.assert_array_equal(camera.distortion, [0.1, 0, 0, 0, 0])
@@ -159,7 +161,7 @@ def test_given_camera() -> None:
     bad = {**given, "focal": 1.0}
     del bad["fx"]
     with pytest.raises(ManifestError) as error:
-        calibrate.compute({"camera": {"given": bad}}, [], knobs.Calibrate())
+        calibrate.compute({"camera": {"given": bad}}, [], Reconstruction(), knobs.Calibrate())
     assert len(error.value.problems) == 2
 
 
@@ -183,7 +185,7 @@ def photographs_of(folder: Path) -> tuple[dict, list[dict[str, str]]]:
     ],
 )  # fmt: skip
 def test_captures_with_known_lens(folder: Path, truth: Camera) -> None:
-    result = calibrate.compute(*photographs_of(folder), knobs.Calibrate())
+    result = calibrate.compute(*photographs_of(folder), Reconstruction(), knobs.Calibrate())
     camera = result.outputs["camera"]
     assert result.numbers["rms_px"] < 0.2  # the brief's figure
     assert abs(camera.fx / truth.fx - 1) < 1e-3  # measured 1e-4 and 4e-4

@@ -14,7 +14,7 @@ from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.conventions import WORLD_FROM_BOARD, invert_rigid
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
-from pipeline.types import Camera, Raster
+from pipeline.types import Camera, Raster, Reconstruction
 from stages import knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1, distortion=np.array([-0.1, 0.02, 0, 0, 0]))
@@ -61,7 +61,9 @@ def test_board_views_and_tripod(board_pictures) -> None:
     # 24 stops between the views' units must not matter, nor a bright window beside the board.
     pictures = {name: (picture + noise[name]) * 4096.0 for name, picture in pictures.items()}
     pictures["ball_b"][:40] *= 1000
-    result = pose.compute(facts(), {name: raster(p) for name, p in pictures.items()}, CAMERA, {}, PARAMS)
+    result = pose.compute(
+        facts(), {name: raster(p) for name, p in pictures.items()}, CAMERA, {}, Reconstruction(), [], PARAMS
+    )
     views = result.outputs["views"]
     assert [view.route for view in views.values()] == ["charuco", "same_as", "charuco"]
     np.testing.assert_array_equal(views["ball_a"].world_from_camera, views["plate"].world_from_camera)
@@ -81,7 +83,7 @@ def test_moved_tripod_keeps_its_own_pose(board_pictures) -> None:
         "ball_a": raster(np.roll(board_pictures["plate"], 2, axis=1)),
         "ball_b": raster(board_pictures["other"]),
     }
-    result = pose.compute(facts(), photographs, CAMERA, {}, PARAMS)
+    result = pose.compute(facts(), photographs, CAMERA, {}, Reconstruction(), [], PARAMS)
     assert any("ball_a: the tripod moved" in warning for warning in result.warnings)
     assert result.numbers["ball_a"]["tripod_shift_px"] == pytest.approx(2, abs=0.1)
     assert result.outputs["views"]["ball_a"].route == "charuco"
@@ -91,16 +93,18 @@ def test_tripod_view_without_board_takes_the_plates_pose(board_pictures) -> None
     photographs = {name: raster(np.full((360, 480), 0.3)) for name in ("ball_a", "ball_b")}
     photographs["plate"] = raster(board_pictures["plate"])
     with pytest.raises(CaptureError, match="ball_b: 0 corners of the board found"):
-        pose.compute(facts(), photographs, CAMERA, {}, PARAMS)
+        pose.compute(facts(), photographs, CAMERA, {}, Reconstruction(), [], PARAMS)
     only = facts(ball=[{"name": "ball_a", "tripod": True}])
-    views = pose.compute(only, photographs, CAMERA, {}, PARAMS).outputs["views"]
+    views = pose.compute(only, photographs, CAMERA, {}, Reconstruction(), [], PARAMS).outputs["views"]
     assert views["ball_a"].route == "same_as"
 
 
 def test_single_marker(marker_picture) -> None:
-    stage_facts = facts(board=None, marker=MARKER, ball=[])
+    stage_facts = facts(board=None, marker=[MARKER], ball=[])
     truth = looking_at(np.zeros(3), 40, 10, 0.42)
-    view = pose.compute(stage_facts, {"plate": raster(marker_picture)}, CAMERA, {}, PARAMS).outputs["views"]["plate"]
+    view = pose.compute(
+        stage_facts, {"plate": raster(marker_picture)}, CAMERA, {}, Reconstruction(), [], PARAMS
+    ).outputs["views"]["plate"]
     rotation_deg, position_m, mahalanobis = error_of(view, truth)
     assert view.route == "marker"
     assert rotation_deg < 0.15  # a marker of 150 px: 0.1 px corners give 0.1 deg, rendered ones are four times better
@@ -108,7 +112,7 @@ def test_single_marker(marker_picture) -> None:
     assert mahalanobis < 22.5
     absent = facts(board=None, marker={**MARKER, "id": 3}, ball=[])
     with pytest.raises(CaptureError, match="plate: 0 corners of the marker"):
-        pose.compute(absent, {"plate": raster(marker_picture)}, CAMERA, {}, PARAMS)
+        pose.compute(absent, {"plate": raster(marker_picture)}, CAMERA, {}, Reconstruction(), [], PARAMS)
 
 
 def test_duplicated_marker_is_refused(marker_picture) -> None:
@@ -116,20 +120,28 @@ def test_duplicated_marker_is_refused(marker_picture) -> None:
     twice = np.full((360, 480), 0.3)
     twice[:180, :240], twice[180:, 240:] = small, small
     with pytest.raises(CaptureError, match="seen 2 times"):
-        pose.compute(facts(board=None, marker=MARKER, ball=[]), {"plate": raster(twice)}, CAMERA, {}, PARAMS)
+        pose.compute(
+            facts(board=None, marker=[MARKER], ball=[]),
+            {"plate": raster(twice)},
+            CAMERA,
+            {},
+            Reconstruction(),
+            [],
+            PARAMS,
+        )
 
 
 def test_ambiguous_marker_is_refused_with_both_poses() -> None:
     """A marker of 40 px, sharp enough at 0.1 px, is refused when its corners are stated to 0.5 px."""
     far = looking_at(np.zeros(3), 22, 10, 1.6)
     stage_facts, photographs = (
-        facts(board=None, marker=MARKER, ball=[]),
+        facts(board=None, marker=[MARKER], ball=[]),
         {"plate": raster(photograph(marker_print(MARKER), CAMERA, far, 4))},
     )
-    view = pose.compute(stage_facts, photographs, CAMERA, {}, PARAMS).outputs["views"]["plate"]
+    view = pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [], PARAMS).outputs["views"]["plate"]
     assert error_of(view, far)[0] < 1
     with pytest.raises(NumericalError, match=r"plate: two poses explain .* camera at \(.*\), or camera at \("):
-        pose.compute(stage_facts, photographs, CAMERA, {}, knobs.Pose(corner_sigma_px=0.5))
+        pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose(corner_sigma_px=0.5))
 
 
 def points_of(world_m: np.ndarray, px: np.ndarray) -> list[dict]:
@@ -146,17 +158,27 @@ def test_points_and_given() -> None:
         {"view": "ball_b", "route": "given", "points": [], "world_from_camera": OTHER.tolist()},
     ]
     blank = {name: raster(np.zeros((360, 480))) for name in ("plate", "ball_a", "ball_b")}
-    views = pose.compute(facts(board=None, pose=entries), blank, CAMERA, {}, PARAMS).outputs["views"]
+    views = pose.compute(facts(board=None, pose=entries), blank, CAMERA, {}, Reconstruction(), [], PARAMS).outputs[
+        "views"
+    ]
     assert [view.route for view in views.values()] == ["points", "same_as", "given"]
     assert views["plate"].points == 9
     assert error_of(views["plate"], PLATE)[2] < 22.5
     np.testing.assert_allclose(views["ball_b"].world_from_camera, OTHER, atol=1e-12)
     entries[1]["world_from_camera"] = (np.diag([1, 1, -1, 1]) @ OTHER).tolist()
     with pytest.raises(ManifestError, match="off a rigid motion"):
-        pose.compute(facts(board=None, pose=entries), blank, CAMERA, {}, PARAMS)
+        pose.compute(facts(board=None, pose=entries), blank, CAMERA, {}, Reconstruction(), [], PARAMS)
     line = points_of(np.outer(np.arange(5), [0.1, 0, 0]), px[:5])
     with pytest.raises(NumericalError, match="plate: pose: 5 points on a line"):
-        pose.compute(facts(pose=[{"view": "plate", "route": "points", "points": line}]), blank, CAMERA, {}, PARAMS)
+        pose.compute(
+            facts(pose=[{"view": "plate", "route": "points", "points": line}]),
+            blank,
+            CAMERA,
+            {},
+            Reconstruction(),
+            [],
+            PARAMS,
+        )
 
 
 def test_planar_points_are_tested_for_the_second_pose() -> None:
@@ -166,7 +188,7 @@ def test_planar_points_are_tested_for_the_second_pose() -> None:
     entry = {"view": "plate", "route": "points", "points": points_of(world_m, px)}
     stage_facts = facts(board=None, ball=[], pose=[entry])
     photographs = {"plate": raster(np.zeros((360, 480)))}
-    view = pose.compute(stage_facts, photographs, CAMERA, {}, PARAMS).outputs["views"]["plate"]
+    view = pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [], PARAMS).outputs["views"]["plate"]
     assert error_of(view, far)[0] < 1e-5
     assert view.alternative is not None
     assert view.ambiguity > 4
@@ -174,9 +196,17 @@ def test_planar_points_are_tested_for_the_second_pose() -> None:
 
 def test_sizes_and_missing_facts() -> None:
     with pytest.raises(CaptureError, match=r"photograph is 240x180, camera is 480x360"):
-        pose.compute(facts(ball=[]), {"plate": raster(np.zeros((180, 240)))}, CAMERA, {}, PARAMS)
+        pose.compute(facts(ball=[]), {"plate": raster(np.zeros((180, 240)))}, CAMERA, {}, Reconstruction(), [], PARAMS)
     with pytest.raises(ManifestError, match="neither"):
-        pose.compute(facts(board=None, ball=[]), {"plate": raster(np.zeros((360, 480)))}, CAMERA, {}, PARAMS)
+        pose.compute(
+            facts(board=None, ball=[]),
+            {"plate": raster(np.zeros((360, 480)))},
+            CAMERA,
+            {},
+            Reconstruction(),
+            [],
+            PARAMS,
+        )
 
 
 BOARD_WIDTH_PX = {KITCHEN: 480, DESK: 429}  # in the plate

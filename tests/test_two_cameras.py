@@ -17,7 +17,7 @@ from pipeline.conventions import invert_rigid, latlong_directions, transform_poi
 from pipeline.image import colour
 from pipeline.light.environment import AXES, irradiance
 from pipeline.run.errors import CaptureError, ManifestError
-from pipeline.types import Balance, Camera, Raster, View
+from pipeline.types import Balance, Camera, Raster, Reconstruction, View
 from stages import balance, calibrate, develop, ingest, knobs, merge, pose, probe
 
 OTHER_MATRIX = np.array([[0.95, -0.33, -0.10], [-0.38, 1.15, 0.26], [-0.05, 0.16, 0.55]])
@@ -146,12 +146,12 @@ def test_cameras_of_views_are_kept_apart():
     given = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
     other = {"given": {**given, "fx": 900.0, "fy": 900.0}, "calibration": []}
     balls = [{"name": "a", "camera": None}, {"name": "b", "camera": other}, {"name": "c", "camera": other}]
-    result = calibrate.compute({"camera": {"given": given}, "ball": balls}, [], knobs.Calibrate())
+    result = calibrate.compute({"camera": {"given": given}, "ball": balls}, [], Reconstruction(), knobs.Calibrate())
     assert result.outputs["camera"].fx == 600
     assert {name: camera.fx for name, camera in result.outputs["view_cameras"].items()} == {"b": 900, "c": 900}
     balls[1] = {"name": "b", "camera": {"given": {"fx": 1}, "calibration": []}}
     with pytest.raises(ManifestError) as error:
-        calibrate.compute({"camera": {"given": given}, "ball": balls}, [], knobs.Calibrate())
+        calibrate.compute({"camera": {"given": given}, "ball": balls}, [], Reconstruction(), knobs.Calibrate())
     assert "ball[1].camera.given.fy: missing; it is required" in str(error.value)
 
 
@@ -163,7 +163,7 @@ def test_a_balls_own_board_photographs_calibrate_its_camera():
         "ball": [{"name": "b", "camera": {"calibration": ["x"], "given": None}}],
     }  # fmt: skip
     photos = [{"file": str(file.relative_to(DESK)), "view": "b"} for file in files]
-    result = calibrate.compute(facts, photos, knobs.Calibrate())
+    result = calibrate.compute(facts, photos, Reconstruction(), knobs.Calibrate())
     assert result.outputs["camera"].fx == 600
     assert result.outputs["view_cameras"]["b"].fx == pytest.approx(1150, rel=1e-3)  # the desk's true lens
     assert result.numbers["b"]["rms_px"] < 0.2
@@ -183,7 +183,7 @@ def test_pose_of_each_view_by_its_own_camera():
     shots = {name: photograph(charuco_print(BOARD), cameras[name], place, 4) for name, place in places.items()}
     rasters = {name: Raster({c: np.asarray(s, np.float32) for c in "RGB"}, "acescg") for name, s in shots.items()}
     facts = {"board": BOARD, "marker": None, "ball": [{"name": "ball"}], "pose": []}
-    result = pose.compute(facts, rasters, PLATE_CAMERA, {"ball": BALL_CAMERA}, knobs.Pose())
+    result = pose.compute(facts, rasters, PLATE_CAMERA, {"ball": BALL_CAMERA}, Reconstruction(), [], knobs.Pose())
     views = result.outputs["views"]
     assert views["plate"].camera is None
     assert views["ball"].camera == BALL_CAMERA or views["ball"].camera.fx == 760
@@ -193,7 +193,7 @@ def test_pose_of_each_view_by_its_own_camera():
         assert np.linalg.norm(delta[3:]) < 0.002 * 0.42
         assert delta @ np.linalg.solve(views[name].covariance, delta) < 22.5  # 99.9 % of chi2, six degrees of freedom
     with pytest.raises(CaptureError, match="ball: photograph is 400x420, camera is 480x360"):
-        pose.compute(facts, rasters, PLATE_CAMERA, {}, knobs.Pose())
+        pose.compute(facts, rasters, PLATE_CAMERA, {}, Reconstruction(), [], knobs.Pose())
 
 
 RADIUS = 0.04
