@@ -1,11 +1,11 @@
 """Display-encoded brackets made linear, so that what follows treats them as it treats a sensor's samples.
 
-The curve of each camera is recovered from all of its views together (`pipeline.image.response`); codes become uint16
+The curve of each camera is recovered from all of its views together (`pipeline.image.response`); codes become
 samples proportional to light, with the noise that neighbouring frames show, as if a DNG had stated it. What the curve
 does not know is no noise: it is the same in every pixel of one code, so it is added to the merged variance afterwards.
 
-Limits: the cameras mix channels before they clip the result, so hues drift close to white; one channel's clip is not
-held against the others.
+A pixel of which one channel clips says nothing in the others either, except in the shortest frame: the sensor clipped
+before the camera mixed its channels, so the others are wrong without being clipped. Such samples are NaN.
 """
 
 from __future__ import annotations
@@ -37,17 +37,22 @@ class Linearised:
     brackets: dict[str, Bracket]
     responses: dict[str, Response]
     tables: dict[str, np.ndarray]  # by file: (codes, 3) uint16
+    shortest: set[str] = field(default_factory=set)  # files that are the shortest of a view
     noise: dict[str, np.ndarray] = field(default_factory=dict)  # by file: (6,) shot and floor of R, G, B
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
 
     def samples(self, frame: Frame, codes: np.ndarray) -> np.ndarray:
-        """(H, W, 3) uint16 linear samples of a display-encoded frame's codes; any other frame's as they are."""
+        """(H, W, 3) float32 linear samples of a display-encoded frame's codes; any other frame's as they are."""
         table = self.tables.get(frame.file)
         if table is None:
             return codes
-        return np.stack([table[codes[..., c], c] for c in range(3)], -1)
+        linear = np.stack([table[codes[..., c], c] for c in range(3)], -1).astype(np.float32)
+        if frame.file not in self.shortest:
+            clipped = linear == LINEAR_WHITE
+            linear[clipped.any(-1)[..., None] & ~clipped] = np.nan
+        return linear
 
     def completed(self, merged: Result) -> Result:
         """Merge's result with the curves' share of the variance, and what is to be said of them."""
@@ -89,6 +94,7 @@ def linearise(brackets: dict[str, Bracket], decode: Callable[[Frame], np.ndarray
         response = recover(codes, [[exposure_of(frame) for frame in frames] for frames in group], 1.0)
         noise = pixel_noise(response, codes, [[exposure_of(frame) for frame in frames] for frames in group])
         result.responses[camera] = response
+        result.shortest.update(frames[0].file for frames in group)
         result.noise.update({frame.file: noise.ravel() for frames in group for frame in frames})
         result.tables.update({frame.file: response.table(frame.white) for frames in group for frame in frames})
         _report(result, camera, response, [frame for frames in group for frame in frames])
