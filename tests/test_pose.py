@@ -110,7 +110,7 @@ def test_single_marker(marker_picture) -> None:
     assert rotation_deg < 0.15  # a marker of 150 px: 0.1 px corners give 0.1 deg, rendered ones are four times better
     assert position_m / 0.42 < 2e-3
     assert mahalanobis < 22.5
-    absent = facts(board=None, marker={**MARKER, "id": 3}, ball=[])
+    absent = facts(board=None, marker=[{**MARKER, "id": 3}], ball=[])
     with pytest.raises(CaptureError, match="plate: 0 corners of the marker"):
         pose.compute(absent, {"plate": raster(marker_picture)}, CAMERA, {}, Reconstruction(), [], PARAMS)
 
@@ -251,7 +251,7 @@ def test_captures_with_known_poses(folder: Path, files: dict[str, str]) -> None:
         }
         photographs = {n: min(f, key=lambda r: abs(float(np.median(r["G"])) - 0.18)) for n, f in frames.items()}
     balls = [{"name": name, "tripod": name.endswith("_a")} for name in files if name != "plate"]
-    views = pose.compute(facts(ball=balls), photographs, camera, {}, PARAMS).outputs["views"]
+    views = pose.compute(facts(ball=balls), photographs, camera, {}, Reconstruction(), [], PARAMS).outputs["views"]
     for name, view in views.items():
         rotation_deg, position_m, mahalanobis = error_of(view, poses[name])
         # The figure to reach is 0.05 degrees for a board 480 px wide; a tilt moves corners by the square of the size.
