@@ -20,7 +20,7 @@ from stages.order import NAMES, graph
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/*.py")])
-ROOMS = [*NAMES, "simulate", "ball", "init", "check"]
+ROOMS = [*NAMES, "simulate", "ball", "board", "init", "check"]
 LONGEST = 520  # lines; a file that one reads in one sitting
 
 # The composition roots: the only files outside stages/ that may know them.
@@ -74,6 +74,7 @@ BRIDGES = {
         "pipeline/image/sensitivities.py",
         "pipeline/simulation/spectra.py",
     },
+    "reportlab": {"pipeline/capture/sheet.py"},
     "lensfunpy": {"pipeline/image/vignetting.py"},
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
     "flip_evaluator": {"pipeline/image/metrics.py"},

@@ -8,11 +8,12 @@ seen, the ratio of marker to square can. Bridges cv2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.camera.opencv_bridge import dictionary, ours, shrunk
+from pipeline.run.board_facts import LAYOUTS
 
 # The largest of each family: the smaller ones are its first markers, so any that reaches far enough reads the same.
 FAMILIES = (
@@ -59,6 +60,8 @@ class Layout:
     rms: float  # of the marker centres, in marker sides
     pictures: int  # that agree
     ids: tuple[int, ...]
+    first_id: int = 0
+    name: str = ""  # of a layout that `insitu board` prints
 
 
 def find_markers(grey: np.ndarray, families: Sequence[str] = FAMILIES) -> Markers:
@@ -107,6 +110,8 @@ def layout_of(pictures: Sequence[Markers]) -> Layout | None:
     if len(ids) == 1:
         return Layout("marker", name, (1, 1), False, 1.0, 0.0, len(chosen), tuple(ids))
     rich = [p for p in chosen if len(set(p.ids.tolist())) == len(p.ids) and len(p.ids) >= FEWEST]
+    if (printed := _printed(rich)) is not None:
+        return printed
     best: Layout | None = None
     for kind, squares, legacy, centres in _candidates(max(int(p.ids.max()) for p in rich) if rich else 0):
         known = [p for p in rich if p.ids.max() < len(centres)]
@@ -122,6 +127,27 @@ def layout_of(pictures: Sequence[Markers]) -> Layout | None:
     if best is not None:
         return best
     return Layout("unknown", name, (0, 0), False, 0.0, np.inf, len(chosen), tuple(ids))
+
+
+def _printed(pictures: Sequence[Markers]) -> Layout | None:
+    """The layout of `insitu board` that pictures of one family show: its ids are its own, and their places must fit."""
+    for name, facts in LAYOUTS.items():
+        across, down = facts["squares"]
+        centres, first = charuco_centres(across, down, False), facts["first_id"]
+        mine = [_only(p, first, first + len(centres)) for p in pictures if facts["dictionary"].startswith(p.family[:8])]
+        mine = [p for p in mine if len(p.ids) >= FEWEST]
+        fits = [fit for p in mine if (fit := _fit(p, centres, first)) is not None and fit[0] < MAX_RMS]
+        if fits and len(fits) >= len(pictures) // 2:
+            rms, ratio, _ = np.median(np.array(fits), 0)
+            ids = sorted({int(i) for p in mine for i in p.ids})
+            found = ("charuco", facts["dictionary"], (across, down), False, float(ratio), float(rms), len(fits))
+            return Layout(*found, tuple(ids), first, name)
+    return None
+
+
+def _only(picture: Markers, first: int, end: int) -> Markers:
+    kept = (picture.ids >= first) & (picture.ids < end)
+    return replace(picture, ids=picture.ids[kept], corners=picture.corners[kept])
 
 
 def _candidates(largest: int) -> list[tuple[str, tuple[int, int], bool, np.ndarray]]:
@@ -152,11 +178,11 @@ def charuco_centres(across: int, down: int, legacy: bool) -> np.ndarray:
     return np.array(places, float).reshape(-1, 2) + 0.5
 
 
-def _fit(picture: Markers, centres: np.ndarray) -> tuple[float, float, float] | None:
+def _fit(picture: Markers, centres: np.ndarray, first: int = 0) -> tuple[float, float, float] | None:
     """Rms of the centres about their homography, in marker sides; the side in squares, and in px."""
     import cv2
 
-    flat = centres[picture.ids]
+    flat = centres[picture.ids - first]
     seen = marker_centres(picture)
     side = float(np.median(np.linalg.norm(picture.corners - np.roll(picture.corners, 1, 1), axis=-1)))
     homography, _ = cv2.findHomography(flat, seen, 0)

@@ -65,9 +65,12 @@ def charuco_board(board: dict[str, Any]) -> Any:
     """OpenCV's board of the manifest's facts."""
     import cv2
 
-    made = cv2.aruco.CharucoBoard(
-        tuple(board["squares"]), board["square_m"], board["marker_m"], dictionary(board["dictionary"])
-    )
+    across, down = board["squares"]
+    name, ids = board["dictionary"], board.get("first_id", 0) + np.arange(across * down // 2)
+    held = len(dictionary(name).bytesList)
+    if ids[-1] >= held:
+        raise ManifestError(f"board: needs marker ids up to {ids[-1]}; {name} holds {held}; expected a larger one")
+    made = cv2.aruco.CharucoBoard((across, down), board["square_m"], board["marker_m"], dictionary(name), ids)
     made.setLegacyPattern(bool(board.get("legacy", False)))
     return made
 
@@ -156,6 +159,14 @@ def marker_corners_px(picture: np.ndarray, name: str, marker_id: int) -> tuple[n
     ids = np.empty(0, int) if ids is None else np.asarray(ids).ravel()
     chosen = [ours(quad) * step for quad, found in zip(quads, ids, strict=True) if found == marker_id]
     return np.array(chosen).reshape(-1, 4, 2), len(ids)
+
+
+def marker_pattern(name: str, marker_id: int) -> np.ndarray:
+    """(n, n) bool, rows down the print: the black cells of a marker, its black border included."""
+    import cv2
+
+    cells = marker_cells(name)
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary(name), marker_id, cells)) == 0
 
 
 def marker_cells(name: str) -> int:

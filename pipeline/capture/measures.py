@@ -108,8 +108,9 @@ def board_points(markers: Markers, layout: Layout) -> tuple[np.ndarray, np.ndarr
         flat = np.stack([index % layout.squares[0], index // layout.squares[0]], -1) + 0.5
     else:
         return None
-    known = markers.ids < len(flat)
-    return flat[markers.ids[known]], marker_centres(markers)[known]
+    place = markers.ids - layout.first_id
+    known = (place >= 0) & (place < len(flat))
+    return flat[place[known]], marker_centres(markers)[known]
 
 
 def board_tilt(markers: Markers, layout: Layout, camera: Camera | None = None) -> float | None:

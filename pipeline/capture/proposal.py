@@ -159,6 +159,14 @@ def board_lines(layout: Layout | None) -> list[str]:
             "No board or marker was found: give [[pose]] tables, or photograph the board in plate and ball views."
         )
     seen = f"{len(layout.ids)} markers of {layout.dictionary} (ids {layout.ids[0]} to {layout.ids[-1]})"
+    if layout.name:
+        return [
+            *comment(
+                f"Board: {seen} are those of {layout.name}, as insitu board prints it, in {layout.pictures} "
+                "photographs. If a square measures otherwise on the print, say so: square_m = 0.0278"
+            ),
+            "[board]", f'layout = "{layout.name}"',
+        ]  # fmt: skip
     if layout.kind == "charuco":
         across, down = layout.squares
         lines = comment(

@@ -82,6 +82,9 @@ def build_parser() -> argparse.ArgumentParser:
     ball.add_argument("--exposures", help="seconds, as 1/20,1/60,..., where the files' metadata lack them")
     ball.add_argument("--distance-ratio", type=float, default=20.0, help="distance over radius of the ball (20)")
     ball.add_argument("--width", type=int, default=1024, help="of the map [px]; its height is half (1024)")
+    board = verb("board", closure.summary("stages.board"), capture=False)
+    board.add_argument("--paper", choices=["A4", "Letter"], required=True, help="A4 or Letter")
+    board.add_argument("--out", type=Path, default=Path("board.pdf"), help="the PDF (default: board.pdf)")
     init = verb("init", closure.summary("stages.init"), capture=False)
     init.add_argument("folder", type=Path, help="folder of photographs, searched with all folders below")
     init.add_argument("-o", dest="out", type=Path, help="write it here (default: print it); never overwrites")
@@ -149,6 +152,11 @@ def dispatch(args: argparse.Namespace) -> int:
         from stages.ball import ball
 
         ball(args.files, args.out, args.exposures, args.distance_ratio, args.width, say)
+        return 0
+    if args.verb == "board":
+        from stages.board import board
+
+        board(args.paper, args.out, say)
         return 0
     if args.verb == "init":
         from stages.init import init

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
+from pipeline.run.board_facts import BoardFacts
 from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
 from pipeline.run.noise_facts import NoiseFacts
@@ -51,17 +52,6 @@ class BallFacts(Strict):
         if self.camera is not None and not self.camera.calibration and self.camera.given is None:
             raise ValueError("camera: neither calibration photographs nor given numbers")
         return self
-
-
-class BoardFacts(Strict):
-    """The printed ChArUco board that defines the world."""
-
-    dictionary: str = "DICT_5X5_100"
-    squares: tuple[int, int] = Field(description="along x, along y")
-    square_m: float = Field(gt=0.001, lt=1.0)
-    marker_m: float = Field(gt=0.0005, lt=1.0)
-    margin_m: float = Field(0.0, ge=0, description="white paper around the print")
-    legacy: bool = False
 
 
 class MarkerFacts(Strict):

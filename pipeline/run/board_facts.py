@@ -1,0 +1,64 @@
+"""Facts of the printed board: stated number by number, or by the name of a layout that `insitu board` prints.
+
+The ids of a printed layout's markers are its own, so a photograph tells which layout it shows. Imports no numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from pipeline.run.strict import Strict
+
+# Both carry the same squares. A range of ids is never used again for another layout: prints outlive versions.
+LAYOUTS: dict[str, dict[str, Any]] = {
+    "insitu-a4": {"dictionary": "DICT_5X5_1000", "first_id": 600, "squares": [9, 6], "square_m": 0.028,
+                  "marker_m": 0.021, "margin_m": 0.012},
+    "insitu-letter": {"dictionary": "DICT_5X5_1000", "first_id": 650, "squares": [9, 6], "square_m": 0.028,
+                      "marker_m": 0.021, "margin_m": 0.012},
+}  # fmt: skip
+MEASURED = {"layout", "square_m", "margin_m"}  # what may stand beside a layout's name
+FARTHEST_SCALE = 1.5  # of a print: beyond it the measured number is a slip
+
+
+class BoardFacts(Strict):
+    """The printed ChArUco board that defines the world."""
+
+    layout: str | None = Field(None, description=f"{' or '.join(LAYOUTS)}, as insitu board prints it; says the rest")
+    dictionary: str = "DICT_5X5_100"
+    first_id: int = Field(0, ge=0, description="of its markers")
+    squares: tuple[int, int] = Field(description="along x, along y")
+    square_m: float = Field(gt=0.001, lt=1.0, description="beside a layout: as measured on the print")
+    marker_m: float = Field(gt=0.0005, lt=1.0)
+    margin_m: float = Field(0.0, ge=0, description="white paper around the print")
+    legacy: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _laid_out(cls, value: Any) -> Any:
+        """The numbers of a named layout, scaled to the measured square."""
+        if not isinstance(value, dict) or value.get("layout") is None:
+            return value
+        known = LAYOUTS.get(value["layout"])
+        if known is None:
+            raise ValueError(f"layout is {value['layout']!r}; expected {' or '.join(LAYOUTS)}")
+        square_m = value.get("square_m", known["square_m"])
+        scale = square_m / known["square_m"] if isinstance(square_m, int | float) else 1.0
+        if not 1 / FARTHEST_SCALE < scale < FARTHEST_SCALE:
+            raise ValueError(
+                f"square_m is {square_m:g}; layout {value['layout']} prints {known['square_m']:g}; measure one square"
+            )
+        whole = {**known, "legacy": False, "marker_m": known["marker_m"] * scale}
+        said = [key for key in value if key not in MEASURED and not _same(value[key], whole.get(key))]
+        if said:
+            raise ValueError(f"layout {value['layout']} does not have this {said[0]}; expected only square_m beside it")
+        return whole | value
+
+
+def _same(stated: Any, known: Any) -> bool:
+    """Whether two facts say the same: facts of a build are filled in already."""
+    if isinstance(stated, float) and isinstance(known, float):
+        return math.isclose(stated, known)
+    return bool(stated == known or (isinstance(stated, list | tuple) and list(stated) == list(known or [])))
