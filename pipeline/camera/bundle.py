@@ -111,7 +111,7 @@ def adjust(
     """Least squares from a start.
 
     Args:
-        bundle: start and measurements.
+        bundle: start and measurements; without a cloud (M = K = 0) the markers alone hold the views together.
         free: (9, k) for each lens: what of it moves (`adjustment.free_columns`); None holds all.
         prior: (9,) standard uncertainty of each lens's start; infinite where nothing is known.
         hold_first: hold the first pose and the distance of the farthest other: for a cloud without markers.
@@ -119,7 +119,7 @@ def adjust(
 
     Raises NumericalError when the sightings do not fix the unknowns.
     """
-    if len(bundle.px) < FEWEST_SIGHTINGS:
+    if len(bundle.px) < FEWEST_SIGHTINGS and not (bundle.corners and not len(bundle.px)):
         raise NumericalError(
             f"bundle: {len(bundle.px)} sightings of the cloud, needed {FEWEST_SIGHTINGS}; photograph more overlap"
         )
@@ -139,6 +139,15 @@ def adjust(
         # one sighting does not place a point: its block would be singular, and its rounding would spoil the others'
         used &= (np.bincount(bundle.seen_point[used], minlength=len(bundle.points)) > 1)[bundle.seen_point]
     return _finish(bundle, start, layout, priors, anchor, used, sigma)
+
+
+def settled(bundle: Bundle, corner_sigma_px: float) -> tuple[Bundle, float]:
+    """A bundle without a cloud at its minimum, lenses held, and chi-square of its corners there."""
+    none, sigma = np.zeros(0, bool), (1.0, corner_sigma_px)
+    layout, priors = _layout(bundle, [np.zeros((9, 0))] * len(bundle.cameras), False), [np.full(9, np.inf)]
+    priors *= len(bundle.cameras)
+    found = _descend(bundle, bundle, layout, priors, None, none, sigma)
+    return found, _cost(_terms(found), none, sigma)
 
 
 def _layout(bundle: Bundle, free: list[np.ndarray], hold_first: bool) -> _Layout:
@@ -376,11 +385,12 @@ def _noise(bundle: Bundle, used: np.ndarray, corner_sigma_px: float | None, layo
     track = residuals[:count][used]
     seen = np.bincount(bundle.seen_point[used], minlength=len(bundle.points))
     freedom = max((2 * used.sum() - 3 * (seen > 0).sum() - layout.size) / max(2 * used.sum(), 1), 0.05)
-    spread = float(1.4826 * np.median(np.abs(track))) / np.sqrt(freedom)
+    spread = float(1.4826 * np.median(np.abs(track))) / np.sqrt(freedom) if used.any() else 0.0
     corners = residuals[count:]
     if corner_sigma_px is not None or len(corners) < 12:
         return max(spread, TRACK_FLOOR_PX), corner_sigma_px or 0.1
-    measured = float(np.sqrt((corners**2).mean() * corners.size / max(corners.size - 6 * len(bundle.markers), 6)))
+    taken = 6 * len(bundle.markers) if count else layout.size  # the tracks hold the views, where there are any
+    measured = float(np.sqrt((corners**2).mean() * corners.size / max(corners.size - taken, 6)))
     return max(spread, TRACK_FLOOR_PX), max(measured, CORNER_FLOOR_PX)
 
 
