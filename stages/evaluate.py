@@ -6,7 +6,7 @@ probe and albedo are off. One scale per capture, from the plates, is used for al
 Self-check, without truth: the mirror ball's photograph from the map, each ball view against the other, the ball's own
 shadow on the plane, and the albedo of the board's white paper. The map was made from these ball photographs, so their
 prediction is *in sample*: it finds errors of geometry, not of exposure. The disagreement of two views and the shadow
-use data that the map was not fitted to. Limits: the map is distant light, the ball mirrors it once to the plane.
+use data that the map was not fitted to. Limits: the map is distant light but for what the plane and the ball exchange.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from pipeline.image import metrics
 from pipeline.image.balance import balanced
 from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
-from pipeline.light import near_field, prediction
+from pipeline.light import ball_shadow, near_field, prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
+from pipeline.probes import clipped
 from pipeline.run.artifacts import (
     ALBEDO,
     BALANCE,
@@ -267,8 +268,10 @@ def shadow_check(
     )
     if not usable.any():
         return {"points": 0}
-    blocked, mirrored = prediction.ball_shadow(
-        light, points[usable], plane.normal, centre, ball.radius_m, ball.reflectance
+    rest = clipped.setting(light, np.zeros_like(light), [])
+    blocked, mirrored = (
+        clipped.shadow_of(rest, points[usable], ball_shadow.Ball(centre, ball.radius_m, reflectance))
+        for reflectance in (np.zeros(3), ball.reflectance)
     )
     far = np.abs(mirrored - 1).max(-1) < UNCHANGED
     gain = np.median(measured[usable][far] / mirrored[far], axis=0) if far.any() else np.ones(3)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import invert_rigid, latlong_directions, transform_points
-from pipeline.light import prediction
+from pipeline.light import ball_shadow, prediction
 from pipeline.light.harmonics import COSINE_LOBE, sh9_of_environment
+from pipeline.probes import clipped
 from pipeline.run import formats
 from pipeline.types import BallFit, Camera, Harmonics, Plane, Raster, View
 
@@ -97,7 +98,7 @@ def acescg(rgb, layers=None, **more) -> Raster:
 
 
 def ball_photograph(camera, view, ball, light, with_shadow) -> np.ndarray:
-    """The plate, darkened by the ball's exact shadow with one mirror bounce, and the ball in front."""
+    """The plate, darkened by the ball's shadow (its model has its own test, in test_clipped), and the ball in front."""
     whole = slice(0, HEIGHT), slice(0, WIDTH)
     plane = Plane(normal=NORMAL, offset_m=0, covariance=np.zeros((3, 3)), corners_m=np.zeros((4, 3)), source="board")
     px = prediction.pixel_centres(*whole).reshape(-1, 2)
@@ -105,9 +106,9 @@ def ball_photograph(camera, view, ball, light, with_shadow) -> np.ndarray:
     picture = np.full((HEIGHT * WIDTH, 3), 0.2)
     near = np.isfinite(hits[:, 0]) & (np.linalg.norm(hits - CENTRE, axis=-1) < 5.5 * RADIUS)
     near &= np.linalg.norm(hits - CENTRE, axis=-1) > RADIUS * 1.001
-    shaded = np.flatnonzero(near & with_shadow)
-    for part in np.array_split(shaded, 10):
-        picture[part] *= prediction.ball_shadow(light, hits[part], NORMAL, CENTRE, RADIUS, np.ones(3))[1]
+    if with_shadow:
+        rest, mirror = clipped.setting(light, 0 * light, []), ball_shadow.Ball(CENTRE, RADIUS, np.ones(3))
+        picture[near] *= clipped.shadow_of(rest, hits[near], mirror)
     picture = picture.reshape(HEIGHT, WIDTH, 3)
     directions, sine = prediction.ball_directions(camera, ball, view.world_from_camera, *whole)
     mirrored = prediction.mirrored_picture(light, directions, np.ones(3))

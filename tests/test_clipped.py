@@ -15,7 +15,7 @@ from pipeline.light import ball_shadow
 from pipeline.light.flux import Card, Shadow, predicted, solve
 from pipeline.probes import clipped
 from pipeline.probes.clipped_lights import find_lights
-from pipeline.probes.shadow_blocks import plane_blocks
+from pipeline.probes.shadow_blocks import MODEL, plane_blocks
 from pipeline.types import BallFit, Raster
 from stages import knobs
 from stages import lights as room
@@ -300,6 +300,27 @@ def test_thrown_light_is_that_of_counted_rays(scene):
 
 def test_visible_part_of_a_disc():
     assert ball_shadow.visible_part(np.array([-1.0, -0.1, 0.0, 0.1, 1.0]), 0.1) == pytest.approx([0, 0, 0.5, 1, 1])
+
+
+@pytest.mark.parametrize("strengths", [[0, 0, 0, 0], [1, 0.5, 0, 0], [20, 0, 0, 0]])
+def test_the_shadow_of_a_known_map_is_that_of_the_photographs(scene, pictures, strengths):
+    """What the self-check predicts, against an integration that shares no code; away from the shadows' sharp edges.
+
+    `MODEL` is what the model is said to leave out; 95 % of the blocks must be within it.
+    """
+    free = flux_scene.sky_irradiance(scene).mean()
+    fluxes = [strength * free * COLOUR for strength in strengths]
+    plate, ball = pictures.at(fluxes)
+    rasters = [flux_scene.raster(one, np.inf, 0, noise=0, floor=1e-9, blur=0.01) for one in (ball, plate)]
+    blocks = plane_blocks(*rasters, scene.camera, scene.world_from_camera, ball_fit(scene))
+    rgb, _ = flux_scene.true_map(scene, fluxes, np.inf)
+    place = ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance)
+    predicted = clipped.shadow_of(clipped.setting(rgb, 0 * rgb, []), blocks.points, place)
+    clear = np.ones(len(blocks.points), bool)
+    for lamp, strength in zip(scene.lamps, strengths, strict=True):
+        edge = ball_shadow.edge_angle(blocks.points, lamp.direction, place)
+        clear &= (strength == 0) | (np.abs(edge) > np.radians(4))
+    assert np.percentile(np.abs(predicted - blocks.ratio)[clear], 95) < MODEL
 
 
 def test_components_join_over_the_seam_and_glare_belongs_to_its_lamp():

@@ -11,19 +11,15 @@ import numpy as np
 from pipeline.camera.lens import pixel_rays, project
 from pipeline.conventions import (
     invert_rigid,
-    latlong_directions,
     latlong_from_direction,
-    latlong_solid_angles,
     transform_points,
 )
 from pipeline.image.metrics import box
-from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.reflection import directions_from_rays
 from pipeline.transport.conductors import GRAZING, reflectance_at
 from pipeline.types import BallFit, Camera, Plane
 
-SHADOW_MAP = (64, 128)  # texels of the light that casts the ball's shadow: 2.8 deg, the ball is 20 deg and more
 SAMPLE_ROW = 1024
 OUTLINE_PX = 4.0  # rim of the ball's picture that is left out beside its silhouette
 
@@ -108,42 +104,6 @@ def splat(directions: np.ndarray, values: np.ndarray, height: int, width: int) -
     sums = np.stack([np.bincount(texel, values[:, c], height * width) for c in range(values.shape[1])], -1)
     mean = np.divide(sums, count[:, None], out=np.zeros_like(sums), where=count[:, None] > 0)
     return mean.reshape(height, width, -1), count.reshape(height, width)
-
-
-def ball_shadow(
-    environment: np.ndarray, points: np.ndarray, normal: np.ndarray, centre: np.ndarray, radius: float,
-    reflectance: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Ratio (N, 3) of the irradiance with a mirror ball to that without, at plane ``points`` (N, 3), world frame.
-
-    First result: the ball only blocks light. Second: it also mirrors the map once towards the point. The map is
-    distant; its texels (2.8 deg) soften the edge, the visible part of a cut texel is taken as linear in the angle.
-    """
-    light = resize_environment(environment, *SHADOW_MAP)
-    directions, weight = latlong_directions(*SHADOW_MAP), latlong_solid_angles(*SHADOW_MAP)
-    cosine = directions @ normal
-    above = cosine > 0
-    ways = directions[above].astype(np.float32)
-    flux = (light[above] * (weight * cosine)[above][:, None]).astype(np.float32)
-    arm = centre - points
-    distance = np.linalg.norm(arm, axis=-1)
-    limit = np.arcsin(np.minimum(radius / distance, 1)).astype(np.float32)
-    along = (arm.astype(np.float32)) @ ways.T  # (N, M) metres
-    angle = np.arccos(np.clip(along / distance[:, None].astype(np.float32), -1, 1))
-    hidden = np.clip(0.5 + (limit[:, None] - angle) * np.float32(SHADOW_MAP[0] / np.pi), 0, 1)
-    total = flux.sum(0)
-    blocked = hidden @ flux
-    mirrored = np.zeros_like(blocked)
-    point, way = np.nonzero(angle < limit[:, None])
-    if point.size:
-        reach = along[point, way]
-        step = reach - np.sqrt(np.maximum(reach**2 - distance[point] ** 2 + radius**2, 0))
-        outward = (step[:, None] * ways[way] - arm[point]) / radius
-        away = ways[way] - 2 * (ways[way] * outward).sum(-1, keepdims=True) * outward
-        bounced = lookup(light, away) * reflectance * (weight * cosine)[above][way][:, None]
-        bounced *= hidden[point, way][:, None]
-        mirrored = np.stack([np.bincount(point, bounced[:, c], len(points)) for c in range(3)], -1)
-    return 1 - blocked / total, 1 - (blocked - mirrored) / total
 
 
 def shadow_ratio(

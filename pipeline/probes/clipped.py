@@ -410,6 +410,13 @@ def _uncertain(seen: Witness, everyone: list[Light]) -> list[tuple[ball_shadow.B
     return others
 
 
+def shadow_of(rest: Setting, points: np.ndarray, ball: ball_shadow.Ball) -> np.ndarray:
+    """Irradiance at plane points (N, 3) with the ball there over that without it, (N, 3), all lamps known."""
+    prepared = _prepared(points, ball, rest, rest.known)
+    flux = np.array([light.bound for light in rest.known]).reshape(-1, 3)
+    return predicted(prepared.reach(rest.free + prepared.cosine @ flux), flux)[0]
+
+
 def edge_of(seen: Witness, rest: Setting, asked: list[Light], k: int, flux: np.ndarray) -> Edge | None:
     """Lamp ``k`` from the edge of its shadow, where no other lamp's edge lies; None if it does not tell."""
     assert seen.ball is not None
