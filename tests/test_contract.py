@@ -20,7 +20,7 @@ from stages.order import NAMES, graph
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted([*ROOT.glob("pipeline/**/*.py"), *ROOT.glob("stages/*.py")])
-ROOMS = [*NAMES, "simulate", "ball", "board", "init", "check"]
+ROOMS = [*NAMES, "simulate", "ball", "board", "init", "check", "stmap"]
 LONGEST = 520  # lines; a file that one reads in one sitting
 
 # The composition roots: the only files outside stages/ that may know them.

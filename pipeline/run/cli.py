@@ -64,6 +64,8 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--upto", help="last stage to run")
     asking(verb("settings", "resolve what a run is asked into settings.json"))
     verb("summary", "print results, errors against truth and seconds per stage")
+    maps = verb("stmap", closure.summary("stages.stmap"))
+    maps.add_argument("--to", type=Path, help="folder of the maps (default: stmap in the build folder)")
     verb("verify", "recompute the digest of every file of a build")
     for name in stage_names():
         sub = verb(name, closure.summary(f"stages.{name}"))
@@ -270,8 +272,20 @@ def with_build(args: argparse.Namespace) -> int:
         problems = build.verify()
         say("\n".join(problems) or f"{out}: every file is as its stage wrote it")
         return 4 if problems else 0
+    if args.verb == "stmap":
+        return straightened(args, build)
     with shown(), build.stop.listening():
         return at_work(args, build, last)
+
+
+def straightened(args: argparse.Namespace, build: Build) -> int:
+    """Lens maps of the plate's camera and of balls that have their own, after what they need."""
+    from pipeline.run.artifacts import CAMERA, VIEW_CAMERAS
+    from stages.stmap import stmap
+
+    build.run_all(build.graph.upto("calibrate"), lambda *_: None)
+    stmap({"plate": build.value(CAMERA), **build.value(VIEW_CAMERAS)}, args.to or build.out / "stmap", say)
+    return 0
 
 
 def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
