@@ -14,18 +14,22 @@ the stated size; a wrong size scales the world unnoticed.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera.lens import project
-from pipeline.camera.markers import fit_marker, grey, marker_points, tone
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px, read_grey
-from pipeline.camera.resection import Resection, is_planar, refine, resect_plane
-from pipeline.camera.rigid import camera_points, difference, nearest_rotation
+from pipeline.camera.marker_map import MarkerMap, residuals_of, with_tripod
+from pipeline.camera.markers import grey
+from pipeline.camera.opencv_bridge import Sightings, read_grey
+from pipeline.camera.resection import Resection, refine, resect_plane
+from pipeline.camera.rigid import camera_points, difference
 from pipeline.camera.sfm import Seen, oriented, scale_sigma, scaled_covariance
+from pipeline.camera.sights import FEWEST_CORNERS, marks_in, sighted_board, sighted_marker
+from pipeline.camera.stated import rigid
+from pipeline.camera.survey import resect_points
 from pipeline.image.colour import decode_srgb
 from pipeline.run.artifacts import (
     CAMERA,
@@ -41,8 +45,6 @@ from pipeline.run.stage import Stage
 from pipeline.types import Camera, Frame, Raster, Reconstruction, Result, View
 from stages import knobs
 
-FEWEST_CORNERS = 6
-ENOUGH_OF_BOARD = 0.7  # with fewer corners than this fraction the other tone curve is tried too
 MOVED_CHI2 = 22.46  # 99.9 % of chi2 with six degrees of freedom
 WIDE_ROTATION_DEG = 1.0
 LARGE_RMS_PX = 0.5
@@ -68,7 +70,9 @@ def compute(
     orders = {name: order_of(facts, name, balls) for name in ("plate", *balls)}
     cameras = {name: view_cameras.get(name, camera) for name in orders}
     check_sizes(photographs, cameras)
-    looked = [name for name, order in orders.items() if order["route"] in ("charuco", "marker")]
+    several = len(facts.get("marker") or []) > 1
+    mapped = [name for name, order in orders.items() if order["route"] == "marker" and several]
+    looked = [name for name, order in orders.items() if order["route"] in ("charuco", "marker") and name not in mapped]
     with ThreadPoolExecutor(2) as pool:  # OpenCV releases the GIL
         sights = dict(
             zip(looked, pool.map(lambda n: sight(facts, n, orders[n], photographs[n], cameras[n]), looked), strict=True)
@@ -82,6 +86,10 @@ def compute(
     if asked:
         placed, extra = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
         views |= placed
+    places: dict[str, Any] = {}
+    if mapped:
+        by_marker = by_map(facts, mapped, tripod, photographs, cameras, view_photos, params, warnings)
+        views, estimates, places = views | by_marker[0], by_marker[1], by_marker[2]
     for name in orders:
         if name not in tripod and name not in views:
             estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
@@ -92,10 +100,12 @@ def compute(
     numbers = {
         name: figures(name, view, estimates.get(name), sights.get(name), warnings) for name, view in views.items()
     }
-    for name, shift in shifts.items():
+    for name, shift in {**shifts, **places.pop("tripod_shift_px", {})}.items():
         numbers[name]["tripod_shift_px"] = shift
     if extra:
         numbers["sfm"] = extra
+    if places:
+        numbers["marker_map"] = places
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
     return Result({"views": result}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
@@ -136,12 +146,8 @@ def by_views(
     seen: dict[str, list[Seen]] = {}
     for number, name in enumerate(reconstruction.names):
         lens = cameras[reconstruction.camera_of[number]]
-        if name in files:
-            encoded = np.asarray(read_grey(root / name), np.float32) / 255
-            linear = np.asarray(decode_srgb(encoded), np.float32)
-        else:
-            linear = grey(photographs[name].rgb())
-        seen[name] = marks_in(facts, linear, lens)
+        linear = linear_of(root / name) if name in files else grey(photographs[name].rgb())
+        seen[name] = marks_in(facts, linear, lens)[0]
     done, markers = oriented(reconstruction, cameras, seen, None)
     views: dict[str, View] = {}
     scale = scale_sigma(done)
@@ -178,24 +184,100 @@ def by_views(
     return views, numbers
 
 
-def marks_in(facts: dict[str, Any], linear: np.ndarray, camera: Camera) -> list[Seen]:
-    """The board, or the markers, seen in one photograph; those that cannot be measured are left out."""
-    pictures = [(tone(linear, curve) * 255 + 0.5).astype(np.uint8) for curve in ("gamma", "log")]
-    if facts.get("board"):
-        sights = board_sightings(pictures[0], tone(linear), facts["board"], camera)
-        return [Seen(0, sights.world_m, sights.px)] if len(sights.px) >= FEWEST_CORNERS else []
-    found = []
-    for number, marker in enumerate(facts["marker"]):
-        tries = (marker_corners_px(picture, marker["dictionary"], marker["id"])[0] for picture in pictures)
-        quads = next((quads for quads in tries if len(quads)), np.empty((0, 4, 2)))
-        if len(quads) != 1:
-            continue
-        try:
-            px = fit_marker(linear, quads[0], camera, marker_cells(marker["dictionary"]))
-        except CaptureError:
-            continue
-        found.append(Seen(number, marker_points(marker["side_m"]), px))
-    return found
+def linear_of(file: Path) -> np.ndarray:
+    """(H, W) float32 linear grey of a further photograph."""
+    return np.asarray(decode_srgb(np.asarray(read_grey(file), np.float32) / 255), np.float32)
+
+
+def by_map(
+    facts: dict[str, Any], asked: list[str], tripod: list[str], photographs: dict[str, Raster],
+    cameras: dict[str, Camera], view_photos: list[Frame], params: knobs.Pose, warnings: list[str],
+) -> tuple[dict[str, View], dict[str, Estimate], dict[str, Any]]:  # fmt: skip
+    """Views, estimates and numbers of the views that show markers of unknown layout; further photographs help."""
+    root, seen, lenses = Path(facts["capture_root"]), {}, dict(cameras)
+    for name in asked:
+        seen[name], notes = marks_in(facts, grey(photographs[name].rgb()), cameras[name])
+        warnings += [f"{name}: {note}" for note in notes]
+    ours = not (facts.get("views") or {}).get("own_camera", False)
+    for photo in view_photos if ours else []:
+        lenses[photo.file] = cameras["plate"]
+        seen[photo.file] = marks_in(facts, linear_of(root / photo.file), cameras["plate"])[0]
+    here = [name for name in tripod if name in asked]
+    found, moved = with_tripod(seen, lenses, here, params.corner_sigma_px, MOVED_CHI2)
+    views: dict[str, View] = {}
+    estimates: dict[str, Estimate] = {}
+    off = residuals_of(found)
+    for name in asked:
+        if name in here and "plate" in found.names and name not in found.names:
+            continue  # it stayed, or shows nothing that says it did not: the plate's pose is its own
+        if name not in found.names:
+            shown = sorted(facts["marker"][one.marker]["id"] for one in seen[name])
+            raise CaptureError(
+                f"{name}: shows {f'markers {shown}' if shown else 'no marker'}, none that hangs together with the "
+                f"first ({facts['marker'][0]['id']}), needed one; photograph both in one picture as well"
+            )
+        estimates[name] = map_estimate(found, name, seen[name], cameras[name], params)
+        refuse_named(name, estimates[name], params)
+        views[name] = view_of(estimates[name])
+    for name, (chi2, shift) in moved.items():
+        if name in views:
+            warnings.append(
+                f"{name}: the tripod moved: markers shifted by {shift:.2f} px (chi2 {chi2:.0f}, expected below "
+                f"{MOVED_CHI2:.0f}); its own pose is used"
+            )
+    for name in here:
+        if name not in views and "plate" in views:
+            views[name] = views["plate"].model_copy(update={"route": "same_as"})
+    numbers = map_numbers(facts, found, off, params, warnings)
+    return views, estimates, numbers | {"tripod_shift_px": {name: shift for name, (_, shift) in moved.items()}}
+
+
+def map_estimate(found: MarkerMap, name: str, marks: list[Seen], camera: Camera, params: knobs.Pose) -> Estimate:
+    """One view of the map as an estimate."""
+    world_m, px, ids = found.world_points(marks)
+    pose = found.done.bundle.poses[found.names.index(name)]
+    covariance, by_lens = found.covariance(name, camera)
+    residuals = px - project(camera, camera_points(pose, world_m)[0])
+    best = Resection(
+        pose, covariance, found.done.pose_covariance[found.names.index(name)], by_lens, residuals,
+        np.ones(len(px), bool), found.done.corner_sigma_px, float((residuals**2).sum()) / params.corner_sigma_px**2,
+        name in found.lone and found.lone[name].frontal,
+    )  # fmt: skip
+    other = found.alternatives.get(name)
+    second = None if other is None else replace(best, world_from_camera=other)
+    return Estimate("marker", Sightings(world_m, px, ids, len(marks)), best, second, found.ambiguity[name])
+
+
+def map_numbers(
+    facts: dict[str, Any], found: MarkerMap, off: dict[tuple[str, int], np.ndarray], params: knobs.Pose,
+    warnings: list[str],
+) -> dict[str, Any]:  # fmt: skip
+    """Where each marker lies and how well that is known; warns about what does not fit."""
+    table = []
+    for at, marker in enumerate(found.markers):
+        sigma = np.sqrt(np.diag(found.done.marker_covariance[at]))
+        names = [name for name, number in off if number == marker]
+        rms = float(np.sqrt(np.concatenate([off[name, marker] ** 2 for name in names]).mean())) if names else 0.0
+        label = f"marker {facts['marker'][marker]['id']}"
+        table.append({
+            **{key: facts["marker"][marker][key] for key in ("dictionary", "id", "side_m")},
+            "world_from_marker": found.done.bundle.markers[at].tolist(), "seen_in": names, "rms_px": rms,
+            "rotation_sigma_deg": float(np.degrees(np.linalg.norm(sigma[:3]))),
+            "position_sigma_m": float(np.linalg.norm(sigma[3:])), "ambiguity": found.unsure.get(marker),
+        })  # fmt: skip
+        if found.unsure.get(marker, np.inf) < params.min_ambiguity:
+            warnings.append(f"{label}: two places explain the pictures; photograph it from another side as well")
+        if rms > LARGE_RMS_PX:
+            warnings.append(f"{label}: residual {rms:.2f} px; was it moved, is its side_m right, is the print flat?")
+    for name, marker in found.left_out:
+        warnings.append(f"{name}: marker {facts['marker'][marker]['id']} contradicts the other views and is left out")
+    lost = [m["id"] for number, m in enumerate(facts["marker"]) if number not in found.markers]
+    if lost:
+        warnings.append(f"markers {lost} hang together with no other; the map is without them")
+    return {
+        "markers": table, "corner_sigma_px": found.done.corner_sigma_px, "seen_by": found.names,
+        "left_out": [[name, facts["marker"][marker]["id"]] for name, marker in found.left_out],
+    }  # fmt: skip
 
 
 def check_sizes(photographs: dict[str, Raster], cameras: dict[str, Camera]) -> None:
@@ -217,32 +299,11 @@ def sight(facts: dict[str, Any], name: str, order: dict[str, Any], photograph: R
     """Corners of the board, or the four corners of the marker, in one view."""
     radiance = grey(photograph.rgb())
     if order["route"] == "charuco":
-        board = facts["board"]
-        total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
-        tries = []
-        for curve in ("gamma", "log"):
-            toned = tone(radiance, curve)
-            tries.append(board_sightings((toned * 255 + 0.5).astype(np.uint8), toned, board, camera))
-            if len(tries[-1].px) >= ENOUGH_OF_BOARD * total:
-                break
-        return max(tries, key=lambda seen: len(seen.px))
-    marker = facts["marker"][0]
-    for curve in ("gamma", "log"):
-        picture = (tone(radiance, curve) * 255 + 0.5).astype(np.uint8)
-        quads, markers = marker_corners_px(picture, marker["dictionary"], marker["id"])
-        if len(quads):
-            break
-    if len(quads) > 1:
-        raise CaptureError(
-            f"{name}: marker {marker['id']} is seen {len(quads)} times, needed once; cover the copies or use another id"
-        )
-    if not len(quads):
-        return Sightings(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, int), markers)
+        return sighted_board(radiance, facts["board"], camera)
     try:
-        px = fit_marker(radiance, quads[0], camera, marker_cells(marker["dictionary"]))
+        return sighted_marker(radiance, facts["marker"][0], camera)
     except CaptureError as error:
         raise CaptureError(f"{name}: {error}") from error
-    return Sightings(marker_points(marker["side_m"]), px, np.arange(4), markers)
 
 
 def estimate_view(
@@ -273,40 +334,31 @@ def estimate_view(
 
 def given_view(name: str, order: dict[str, Any]) -> View:
     """The manifest's matrix as a view; it carries no covariance."""
-    matrix = np.asarray(order.get("world_from_camera"), float)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ManifestError(
-            f"pose: view {name}: world_from_camera is not a 4x4 matrix; it is required by route 'given'"
-        )
-    rotation = nearest_rotation(matrix[:3, :3])
-    error = float(np.abs(matrix[:3, :3] - rotation).max())
-    if error > 1e-3 or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise ManifestError(
-            f"pose: view {name}: world_from_camera is off a rigid motion by {error:.3g}; expected a rotation (no "
-            "scale, no mirror) and a last row 0 0 0 1"
-        )
-    rigid = matrix.copy()
-    rigid[:3, :3] = rotation
-    return View(world_from_camera=rigid, covariance=np.zeros((6, 6)), route="given", rms_px=0.0, points=0)
+    matrix = rigid(np.asarray(order.get("world_from_camera"), float), f"pose: view {name}")
+    return View(world_from_camera=matrix, covariance=np.zeros((6, 6)), route="given", rms_px=0.0, points=0)
 
 
 def points_estimate(order: dict[str, Any], camera: Camera, params: knobs.Pose) -> Estimate:
-    """Pose from surveyed points: LO-RANSAC, then our own least squares; coplanar points get the two-pose test."""
-    from pipeline.camera.colmap_bridge import pose_of_points
+    """Pose from surveyed points; coplanar points get the two-pose test."""
+    points = order["points"]
+    world_m = np.array([point["world_m"] for point in points], float).reshape(-1, 3)
+    px = np.array([point["px"] for point in points], float).reshape(-1, 2)
+    stated = [point.get("sigma_px") for point in points]
+    sigma_px = np.array([params.corner_sigma_px if one is None else one for one in stated], float)
+    sigma_m = np.array([point.get("sigma_m") or 0.0 for point in points], float)
+    found = resect_points(camera, world_m, px, sigma_px, sigma_m)
+    seen = Sightings(world_m[found.agrees], px[found.agrees], np.flatnonzero(found.agrees), 0)
+    estimate = Estimate("points", seen, found.best, found.second, found.ambiguity)
+    refuse_ambiguous(estimate, params)
+    return estimate
 
-    world_m = np.array([point["world_m"] for point in order["points"]], float).reshape(-1, 3)
-    px = np.array([point["px"] for point in order["points"]], float).reshape(-1, 2)
-    is_planar(world_m)  # refuses fewer than four points and points on a line
-    threshold = max(4.0, 20 * params.corner_sigma_px)
-    start = pose_of_points(camera, world_m, px, threshold)
-    distance = np.hypot(*(project(camera, camera_points(start, world_m)[0]) - px).T)
-    agrees = np.where(np.isfinite(distance), distance, np.inf) <= threshold
-    seen = Sightings(world_m[agrees], px[agrees], np.flatnonzero(agrees), 0)
-    if is_planar(seen.world_m):
-        estimate = Estimate("points", seen, *resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px))
+
+def refuse_named(name: str, estimate: Estimate, params: knobs.Pose) -> None:
+    """`refuse_ambiguous`, naming the view."""
+    try:
         refuse_ambiguous(estimate, params)
-        return estimate
-    return Estimate("points", seen, refine(camera, start, seen.world_m, seen.px, params.corner_sigma_px), None, np.inf)
+    except NumericalError as error:
+        raise NumericalError(f"{name}: {error}") from error
 
 
 def refuse_ambiguous(estimate: Estimate, params: knobs.Pose) -> None:
@@ -321,8 +373,8 @@ def refuse_ambiguous(estimate: Estimate, params: knobs.Pose) -> None:
     raise NumericalError(
         f"two poses explain the {estimate.route} picture (chi2 ratio {estimate.ambiguity:.2f}, needed "
         f"{params.min_ambiguity:g}): {spell(estimate.best.world_from_camera)}, or "
-        f"{spell(estimate.second.world_from_camera)}; photograph the marker larger and tilted by 30 deg or more, or "
-        "give the right one as [[pose]] route 'given'"
+        f"{spell(estimate.second.world_from_camera)}; photograph the marker larger and tilted by 30 deg or more, "
+        "lay a second one beside it in two views ([[marker]]), or give the right one as [[pose]] route 'given'"
     )
 
 
@@ -427,7 +479,7 @@ def figures(
 def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: list[Camera]) -> list[dict[str, Any]]:
     """Which pose source each view took, and why."""
     why = {
-        "charuco": "the board is described", "marker": "the single marker is described", "points": "asked for",
+        "charuco": "the board is described", "marker": "markers are described", "points": "asked for",
         "given": "asked for", "same_as": "same tripod position as the plate", "colmap": "asked for",
     }  # fmt: skip
     entries = [

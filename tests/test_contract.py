@@ -40,6 +40,7 @@ BRIDGES = {
         "pipeline/simulation/surfaces.py",  # draws the board; shares no code with what reads it
     },
     "mitsuba": {"pipeline/transport/variant.py"},
+    "pxr": {"pipeline/camera/stated.py"},
     "drjit": {
         "pipeline/transport/caustics.py",
         "pipeline/transport/difference.py",
@@ -87,6 +88,7 @@ SLOW = {*BRIDGES, "scipy"}  # to import; scipy has no place of its own
 LIGHT = {"numpy", "pydantic", "pipeline", "stages"}
 # Import name -> name in pyproject.toml, where they differ.
 DISTRIBUTIONS = {
+    "pxr": "usd-core",
     "pi_heif": "pi-heif",
     "cv2": "opencv-contrib-python-headless", "drjit": "mitsuba", "PIL": "pillow", "PyOpenColorIO": "opencolorio",
     "colour": "colour-science", "colour_demosaicing": "colour-demosaicing", "flip_evaluator": "flip-evaluator",
@@ -171,7 +173,8 @@ def test_library_has_its_bridges_only(library):
 
 def test_every_library_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = {re.split(r"[><=\[ ]", item)[0] for item in project["dependencies"]}
+    items = project["dependencies"] + project["optional-dependencies"]["usd"]
+    declared = {re.split(r"[><=\[ ]", item)[0] for item in items}
     for path in SOURCES:
         foreign = roots(path) - set(sys.stdlib_module_names) - LIGHT
         assert foreign <= SLOW, name_of(path)

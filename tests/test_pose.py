@@ -32,7 +32,7 @@ def raster(grey: np.ndarray) -> Raster:
 
 def facts(**changes) -> dict:
     balls = [{"name": "ball_a", "tripod": True}, {"name": "ball_b", "tripod": False}]
-    return {"board": BOARD, "marker": None, "ball": balls, "pose": [], **changes}
+    return {"board": BOARD, "marker": [], "capture_root": ".", "ball": balls, "pose": [], **changes}
 
 
 @pytest.fixture(scope="module")

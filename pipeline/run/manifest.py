@@ -15,12 +15,13 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
 from pipeline.run.board_facts import BoardFacts
+from pipeline.run.camera_facts import PoseFacts
 from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
 from pipeline.run.noise_facts import NoiseFacts
 from pipeline.run.probe_facts import BALL_KINDS, PROBE_KINDS, ProbeFacts
 from pipeline.run.sensor_facts import SensorFacts
-from pipeline.run.strict import Coordinate, Length, Matrix4, Rgb, Share, Strict
+from pipeline.run.strict import Coordinate, Length, Rgb, Share, Strict
 
 
 class PlateFacts(Strict):
@@ -62,27 +63,11 @@ class MarkerFacts(Strict):
     side_m: float = Field(gt=0.001, lt=5.0)
 
 
-class PointFacts(Strict):
-    """A surveyed point and where it is seen."""
-
-    world_m: tuple[float, float, float]
-    px: tuple[float, float] = Field(description="first pixel centre at (0.5, 0.5)")
-
-
 class ViewsFacts(Strict):
     """Further photographs of the place (JPEG or RAW, one exposure each): they orient the others by what all show."""
 
     files: list[str] = Field(min_length=1, description="files or globs")
     own_camera: bool = Field(False, description="taken by another body, lens or focus than the plate")
-
-
-class PoseFacts(Strict):
-    """How one view is oriented when not by the board."""
-
-    view: str
-    route: Literal["charuco", "marker", "points", "given", "colmap"]
-    points: list[PointFacts] = Field([])
-    world_from_camera: Matrix4 | None = None
 
 
 class ExposureFacts(Strict):

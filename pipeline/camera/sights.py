@@ -1,0 +1,74 @@
+"""What of a board or of markers one developed photograph shows, measured to hundredths of a pixel.
+
+Markers are looked for in a gamma-like picture and, where that hides them, in a logarithmic one; corners are measured on
+linear radiance.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera.markers import fit_marker, marker_points, tone
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px
+from pipeline.camera.sfm import Seen
+from pipeline.run.errors import CaptureError
+from pipeline.types import Camera
+
+FEWEST_CORNERS = 6
+ENOUGH_OF_BOARD = 0.7  # with fewer corners than this fraction the other tone curve is tried too
+CURVES = ("gamma", "log")
+
+
+def eight_bit(toned: np.ndarray) -> np.ndarray:
+    """(H, W) uint8 of a picture in [0, 1]."""
+    return (toned * 255 + 0.5).astype(np.uint8)
+
+
+def sighted_board(radiance: np.ndarray, board: dict[str, Any], camera: Camera) -> Sightings:
+    """Corners of the board in linear radiance (H, W), through the tone curve that shows more of them."""
+    total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
+    tries = []
+    for curve in CURVES:
+        toned = tone(radiance, curve)
+        tries.append(board_sightings(eight_bit(toned), toned, board, camera))
+        if len(tries[-1].px) >= ENOUGH_OF_BOARD * total:
+            break
+    return max(tries, key=lambda seen: len(seen.px))
+
+
+def sighted_marker(radiance: np.ndarray, marker: dict[str, Any], camera: Camera) -> Sightings:
+    """The four corners of a marker in linear radiance (H, W); none when it is not seen.
+
+    Raises CaptureError when it is seen twice, or when an edge cannot be followed.
+    """
+    for curve in CURVES:
+        quads, markers = marker_corners_px(eight_bit(tone(radiance, curve)), marker["dictionary"], marker["id"])
+        if len(quads):
+            break
+    if len(quads) > 1:
+        raise CaptureError(
+            f"marker {marker['id']} is seen {len(quads)} times, needed once; cover the copies or use another id"
+        )
+    if not len(quads):
+        return Sightings(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, int), markers)
+    px = fit_marker(radiance, quads[0], camera, marker_cells(marker["dictionary"]))
+    return Sightings(marker_points(marker["side_m"]), px, np.arange(4), markers)
+
+
+def marks_in(facts: dict[str, Any], radiance: np.ndarray, camera: Camera) -> tuple[list[Seen], list[str]]:
+    """The board, or the markers, in linear radiance (H, W), and why some that are seen are left out."""
+    if facts.get("board"):
+        sights = sighted_board(radiance, facts["board"], camera)
+        return ([Seen(0, sights.world_m, sights.px)] if len(sights.px) >= FEWEST_CORNERS else []), []
+    found, notes = [], []
+    for number, marker in enumerate(facts["marker"]):
+        try:
+            sights = sighted_marker(radiance, marker, camera)
+        except CaptureError as error:
+            notes.append(str(error))
+            continue
+        if len(sights.px):
+            found.append(Seen(number, sights.world_m, sights.px))
+    return found, notes
