@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from pipeline.run import closure, formats, progress
+from pipeline.run import closure, formats, memory, progress
 from pipeline.run.errors import ArtifactError
 from pipeline.run.live import Live, Stop
 from pipeline.run.settings import Settings
@@ -134,16 +134,20 @@ class Build:
         with self.locked(stage):
             return self._run(stage)
 
-    def _run(self, stage: Stage) -> str:
-        wanted = {
+    def wanted(self, stage: Stage) -> dict[str, Any]:
+        """What the record of a stage says when nothing changed. Raises ArtifactError when a producer has not run."""
+        return {
             "stage": stage.name,
             "inputs": self.input_digests(stage),
             "params": self.settings.params[stage.name],
             "code": closure.digest(stage.compute.__module__),
             "versions": self.versions,
         }
+
+    def _run(self, stage: Stage) -> str:
+        wanted = self.wanted(stage)
         old = self.record(stage.name)
-        if old and not stage.impure and self._is_fresh(stage, wanted, old):
+        if old and not stage.impure and self.is_fresh(stage, wanted, old):
             os.utime(self.out / stage.name / "record.json")
             return "fresh"
         folder = self.out / stage.name
@@ -152,6 +156,7 @@ class Build:
         checkpoint = folder / "checkpoint.npz"
         show = functools.partial(self._show, stage)
         live = Live(stage.name, self.stop, checkpoint, _digest_of(wanted), show)
+        memory.reset_peak()
         with progress.hosted(live):
             try:
                 result = self._compute(stage)
@@ -164,10 +169,11 @@ class Build:
         for artifact in stage.outputs.values():
             outputs[artifact.name] = formats.digest(formats.write(folder, artifact, values[artifact.name]))
             self.memory[artifact.name] = outputs[artifact.name], values[artifact.name]
-        seconds = dict(zip(("seconds", "cpu_seconds"), live.spent().tolist(), strict=True))
+        spent = dict(zip(("seconds", "cpu_seconds"), live.spent().tolist(), strict=True))
+        spent["peak_mb"] = memory.peak_mb()  # of the whole process, so with what it holds of earlier stages
         measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
         changed = old is None or old.get("outputs") != outputs
-        record = wanted | {"outputs": outputs} | seconds | measured
+        record = wanted | {"outputs": outputs} | spent | measured
         formats.write_bytes(folder / "record.json", _json(record))
         for warning in result.warnings:
             log.warning("%s: %s", stage.name, warning.removeprefix(f"{stage.name}: "))
@@ -177,7 +183,8 @@ class Build:
         checkpoint.unlink(missing_ok=True)
         return "ran" if changed else "same"
 
-    def _is_fresh(self, stage: Stage, wanted: dict[str, Any], old: dict[str, Any]) -> bool:
+    def is_fresh(self, stage: Stage, wanted: dict[str, Any], old: dict[str, Any]) -> bool:
+        """Whether a record is complete, says what is ``wanted``, and its files are there."""
         if any(old.get(key) != json.loads(_json(value)) for key, value in wanted.items()):
             return False
         if not is_complete(old):
