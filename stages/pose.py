@@ -48,6 +48,7 @@ from stages import knobs
 MOVED_CHI2 = 22.46  # 99.9 % of chi2 with six degrees of freedom
 WIDE_ROTATION_DEG = 1.0
 LARGE_RMS_PX = 0.5
+FAR_M = 1e4  # from the origin: there single precision, which renders, has steps of a millimetre
 
 
 @dataclass(frozen=True)
@@ -470,6 +471,12 @@ def figures(
     if rotation_deg > WIDE_ROTATION_DEG:
         warnings.append(
             f"{name}: rotation is known to {rotation_deg:.1f} deg only; show the marker larger or more tilted"
+        )
+    far_m = float(np.linalg.norm(view.world_from_camera[:3, 3]))
+    if far_m > FAR_M:
+        warnings.append(
+            f"{name}: the camera is {far_m:.3g} m from the origin, needed below {FAR_M:g} for objects to be rendered to "
+            "a millimetre; take a common offset off all world_m"
         )
     if view.rms_px > LARGE_RMS_PX:
         warnings.append(f"{name}: residual {view.rms_px:.2f} px; is the print flat, and its size and the lens right?")

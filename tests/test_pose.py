@@ -14,7 +14,7 @@ from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.conventions import WORLD_FROM_BOARD, invert_rigid
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
-from pipeline.types import Camera, Raster, Reconstruction
+from pipeline.types import Camera, Frame, Raster, Reconstruction
 from stages import knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1, distortion=np.array([-0.1, 0.02, 0, 0, 0]))
@@ -258,3 +258,97 @@ def test_captures_with_known_poses(folder: Path, files: dict[str, str]) -> None:
         assert rotation_deg < 0.05 * max(1.0, 480 / BOARD_WIDTH_PX[folder]) ** 2
         assert position_m / np.linalg.norm(poses[name][:3, 3] - CENTRE) < 1e-3
         assert mahalanobis < 22.5
+
+
+SECOND = {"dictionary": "DICT_APRILTAG_36h11", "id": 11, "side_m": 0.08}
+APART = np.array([0.18, 0.0, 0.03])  # of the second marker's centre from the first's
+
+
+def two_markers() -> tuple[np.ndarray, float, np.ndarray]:
+    """A print with both markers, the second turned by 90 degrees; first at the origin of the world."""
+    first, per_metre, _ = marker_print(MARKER)
+    second, own, _ = marker_print(SECOND)
+    size = round(len(second) * per_metre / own)
+    assert size == pytest.approx(len(second) * per_metre / own)  # no edge of the print is rounded
+    second = np.rot90(
+        np.kron(second, np.ones((7, 7), np.uint8))[:: 7 * len(second) // size, :: 7 * len(second) // size]
+    )
+    assert second.shape == (size, size)
+    side = int(0.4 * per_metre)
+    canvas = np.full((side, side), 255, np.uint8)
+    for picture, centre in ((first, np.zeros(2)), (second, APART[[0, 2]])):
+        at = np.round((centre + 0.15) * per_metre - len(picture) / 2).astype(int)
+        canvas[at[1] : at[1] + len(picture), at[0] : at[0] + len(picture)] = picture
+    return canvas, per_metre, np.full(2, -0.15)
+
+
+def test_views_by_markers_of_unknown_layout(tmp_path: Path) -> None:
+    """The plate shows the second marker only; a ball view and a further photograph show both."""
+    cv2 = pytest.importorskip("cv2")
+    away = {
+        "plate": looking_at(APART, 40, 10, 0.40), "ball_b": looking_at(APART / 2, 35, 70, 0.62),
+        "further.png": looking_at(APART / 2, 45, -40, 0.62),
+    }  # fmt: skip
+    printed = two_markers()
+    pictures = {name: photograph(printed, CAMERA, where, 4) for name, where in away.items()}
+    left = APART + np.array([[-0.05, 0, -0.05], [-0.05, 0, 0.05]])
+    edge = project(CAMERA, camera_points(away["plate"], left)[0])[:, 0].min()
+    pictures["plate"][:, : int(edge) - 4] = 0.3  # hides the first marker
+    curve = np.where(pictures["further.png"] > 0.0031308, 1.055 * pictures["further.png"] ** (1 / 2.4) - 0.055, 0)
+    cv2.imwrite(str(tmp_path / "further.png"), (curve * 255 + 0.5).astype(np.uint8))
+    balls = [{"name": "ball_a", "tripod": True}, {"name": "ball_b", "tripod": False}]
+    stage_facts = facts(board=None, marker=[MARKER, SECOND], ball=balls, capture_root=str(tmp_path), views=None)
+    photographs = {"plate": raster(pictures["plate"]), "ball_a": raster(pictures["plate"]),
+                   "ball_b": raster(pictures["ball_b"])}  # fmt: skip
+    photo = Frame.model_construct(file="further.png", width=480, height=360)
+    result = pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [photo], PARAMS)
+    views, made = result.outputs["views"], result.numbers["marker_map"]
+    assert [view.route for view in views.values()] == ["marker", "same_as", "marker"]
+    for name in ("plate", "ball_b"):
+        rotation_deg, position_m, mahalanobis = error_of(views[name], away[name])
+        # single marker of 100 to 150 px: 0.15 deg above; here through a second one of that size
+        assert rotation_deg < 0.15 * np.sqrt(2)
+        assert position_m / 0.4 < 2e-3 * np.sqrt(2)
+        assert mahalanobis < 22.5
+    assert set(made["seen_by"]) == {"plate", "ball_b", "further.png"}
+    found = next(m for m in made["markers"] if m["id"] == 11)
+    np.testing.assert_allclose(np.array(found["world_from_marker"])[:3, 3], APART, atol=4 * found["position_sigma_m"])
+    assert found["position_sigma_m"] < 2e-3
+    assert result.numbers["ball_a"]["tripod_shift_px"] == 0
+    assert not result.warnings
+    photographs["ball_b"] = raster(photograph(marker_print(MARKER), CAMERA, looking_at(np.zeros(3), 40, 9, 0.4), 2))
+    loose = {**stage_facts, "ball": balls[1:]}
+    with pytest.raises(CaptureError, match=r"plate: shows markers \[11\], none that hangs together with the first"):
+        pose.compute(loose, photographs, CAMERA, {}, Reconstruction(), [], PARAMS)
+
+
+def surveyed(rng: np.random.Generator, sigma_m: np.ndarray, offset: np.ndarray) -> tuple[dict, np.ndarray]:
+    """Points of a room, some surveyed ten times worse, and the truth; world coordinates far from their origin."""
+    world_m = rng.uniform((-2, 0, -2), (2, 2, 2), (len(sigma_m), 3))
+    truth = looking_at(np.array([0.0, 1, 0]), 60, 30, 7.0)
+    px = project(CAMERA, camera_points(truth, world_m)[0]) + 0.3 * rng.standard_normal((len(sigma_m), 2))
+    told = world_m + offset + sigma_m[:, None] * rng.standard_normal((len(sigma_m), 3))
+    points = [{**point, "sigma_m": s, "sigma_px": 0.3} for point, s in zip(points_of(told, px), sigma_m, strict=True)]
+    truth = truth.copy()
+    truth[:3, 3] += offset
+    return {"view": "plate", "route": "points", "points": points}, truth
+
+
+def test_surveyed_points_count_by_their_own_uncertainty() -> None:
+    """Half the points at 3 mm, half at 30 mm (3 px here), coordinates of a national grid: 95 % regions of 80 poses."""
+    rng = np.random.default_rng(11)
+    sigma_m = np.array([0.003, 0.03] * 6)
+    offset = np.array([4.5e6, 500.0, -1.2e6])
+    weighted, plain = [], []
+    for _ in range(80):
+        entry, truth = surveyed(rng, sigma_m, offset)
+        view = pose.view_of(pose.points_estimate(entry, CAMERA, PARAMS))
+        _, position_m, mahalanobis = error_of(view, truth)
+        weighted.append((position_m, mahalanobis))
+        bare = [{key: point[key] for key in ("world_m", "px")} for point in entry["points"]]
+        plain.append(error_of(pose.view_of(pose.points_estimate({**entry, "points": bare}, CAMERA, PARAMS)), truth)[1])
+    position_m, mahalanobis = np.array(weighted).T
+    inside = float(np.mean(mahalanobis <= 12.59))
+    assert inside >= 0.89  # 0.95 - 2.5 standard errors of 80
+    assert np.median(position_m) < 0.75 * np.median(plain)
+    assert 4.8 < np.mean(mahalanobis) < 7.2  # 6 +- 3 sqrt(12 / 80)
