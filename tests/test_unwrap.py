@@ -18,7 +18,7 @@ from pipeline.conventions import (
 from pipeline.light.environment import resize_environment
 from pipeline.light.harmonics import sh9_irradiance, sh9_of_environment
 from pipeline.probes import reflection
-from pipeline.probes.area_sums import area_sums
+from pipeline.probes.area_sums import _stairs, _stairs_kernel, area_sums
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found
 from pipeline.probes.mirror_ball import EDGE_PX, usable_rim, view_map
@@ -149,6 +149,20 @@ def test_sums_over_texels_are_sums_over_pixels(distance_over_radius, radius_px):
     assert -sums[sums < 0].sum() < 4e-3 * sums.sum()  # stairs that cross near the rim; measured 0.2 % of such light
     # texels are float32: 6e-8 each
     assert sums.sum(dtype=float) == pytest.approx(ball_energy(mirror, picture), rel=1e-6)
+
+
+def test_compiled_stairs_are_their_source():
+    """Bit by bit, within the table and beyond it; what has no place becomes no number instead of a wild read."""
+    random = np.random.default_rng(0)
+    table = random.random((12, 17, 4)).cumsum(0).cumsum(1)
+    edges = random.uniform(-3, 20, (4, 60))
+    edges[1, 7] = np.nan
+    beyond, found = np.arange(60) % 9 == 0, np.zeros((2, 60, 4))
+    for run, total in zip((_stairs, _stairs_kernel()), found, strict=True):
+        run(table, *edges, beyond, 2.0, total)
+    np.testing.assert_array_equal(*found)
+    assert np.isnan(found[0, 7]).all()
+    assert not found[0, beyond].any()
 
 
 def test_enlarged_pixels_keep_their_energy():

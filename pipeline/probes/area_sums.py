@@ -11,16 +11,18 @@ nothing but lamps of one pixel 0.1 to 0.2 % comes out negative there; of smooth 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import numpy as np
 
+from pipeline.image.merge_kernel import compiled
 from pipeline.light.sampling import summed_areas
 from pipeline.probes.mirror_geometry import BAND_PIXELS, BAND_TEXELS, WORKERS, Mirror, bands, pixel_solid_angles
 
 STAIR = 0.5  # height of a stair over the texel's thickness
-STEPS = (1, 2, 4, 8, 16, 32)  # stairs per edge
+MOST_STEPS = 32  # stairs per edge, a power of two
 
 
 def area_sums(
@@ -87,13 +89,9 @@ def _edge_sums(
     long texels are thin: ``size**2`` over the length. Along rows and columns one stair is exact. Edges ``beyond`` the
     rim go around the ball instead.
     """
-    total = _stairs(table, x0, y0, x1, y1, 1)
-    wide, high = np.abs(x1 - x0), np.abs(y1 - y0)
-    needed = np.minimum(wide, high) * np.maximum(wide, high) / (STAIR * size * size)
-    for fewer, steps in pairwise(STEPS):
-        now = ~beyond & (needed > fewer) & ((needed <= steps) | (steps == STEPS[-1]))
-        if now.any():
-            total[now] = _stairs(table, x0[now], y0[now], x1[now], y1[now], steps)
+    x0, y0, x1, y1, beyond = (np.ascontiguousarray(part) for part in (x0, y0, x1, y1, beyond))
+    total = np.zeros((*x0.shape, 4))
+    _stairs_kernel()(table, x0.ravel(), y0.ravel(), x1.ravel(), y1.ravel(), beyond.ravel(), size, total.reshape(-1, 4))
     if beyond.any():
         total[beyond] = _around(table, x0[beyond], y0[beyond], x1[beyond], y1[beyond], outline)
     return total
@@ -118,16 +116,45 @@ def _around(
     return end - start + turns[:, None] * table[-1, -1]
 
 
+@functools.cache
+def _stairs_kernel() -> Callable[..., None]:
+    """`_stairs`, compiled."""
+    return compiled(_stairs, _add)
+
+
 def _stairs(
-    table: np.ndarray, x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray, steps: int
-) -> np.ndarray:
-    """What lies left of edges (..., 4) that go straight up in the middle of each of ``steps`` parts."""
-    total = np.zeros((*x0.shape, 4))
-    for k in range(steps):
-        x = x0 + (k + 0.5) / steps * (x1 - x0)
-        total += _interpolated(table, x, y0 + (k + 1) / steps * (y1 - y0))
-        total -= _interpolated(table, x, y0 + k / steps * (y1 - y0))
-    return total
+    table: np.ndarray, x0: np.ndarray, y0: np.ndarray, x1: np.ndarray, y1: np.ndarray, beyond: np.ndarray, size: float,
+    total: np.ndarray,
+) -> None:  # fmt: skip
+    """Into ``total`` (N, 4): what lies left of edges that go straight up in the middle of each of their stairs."""
+    for i in range(x0.size):
+        if beyond[i]:
+            continue
+        dx, dy = x1[i] - x0[i], y1[i] - y0[i]
+        if not np.isfinite(x0[i] + y0[i] + dx + dy):  # compiled code would read anywhere
+            total[i] = np.nan
+            continue
+        needed = abs(dx) * abs(dy) / (STAIR * size * size)
+        steps = 1
+        while steps < needed and steps < MOST_STEPS:
+            steps *= 2
+        for k in range(steps):
+            x = x0[i] + (k + 0.5) / steps * dx
+            _add(table, x, y0[i] + (k + 1) / steps * dy, 1.0, total[i])
+            _add(table, x, y0[i] + k / steps * dy, -1.0, total[i])
+
+
+def _add(table: np.ndarray, x: float, y: float, sign: float, total: np.ndarray) -> None:
+    """`_interpolated` at one place, times ``sign``, added to ``total`` (4,)."""
+    x = min(max(x, 0.0), table.shape[1] - 1 - 1e-9)
+    y = min(max(y, 0.0), table.shape[0] - 1 - 1e-9)
+    column, row = int(x), int(y)
+    right, down = x - column, y - row
+    for c in range(4):
+        above, below = table[row, column, c], table[row + 1, column, c]
+        above += right * (table[row, column + 1, c] - above)
+        below += right * (table[row + 1, column + 1, c] - below)
+        total[c] += sign * (above + down * (below - above))
 
 
 def _interpolated(table: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
