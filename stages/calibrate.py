@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera import board_doubts
 from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
 from pipeline.camera.lens import project, unproject
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration, read_grey
-from pipeline.camera.resection import refine, robust_scale
+from pipeline.camera.resection import minimise, refine, residuals_and_jacobian, robust_scale
 from pipeline.camera.sfm import self_calibrated
 from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
@@ -34,6 +35,8 @@ from stages import knobs
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",))
 FEWEST_CORNERS = 8  # of a photograph that is used
 FEWEST_PHOTOS = 3
+FEW_TWICE = 2  # ids seen twice: one may be texture that reads as a marker
+SAME_FOCAL = 0.01
 NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
 NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
 GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
@@ -161,17 +164,25 @@ def sight(
     sizes = {size: file for file, (size, _) in zip(files, found, strict=True)}
     if len(sizes) > 1:
         listed = ", ".join(f"{w}x{h} ({file})" for (w, h), file in sizes.items())
-        raise CaptureError(f"calibration photographs: sizes {listed}, needed one size; take out the others")
-    usable = [i for i, (_, seen) in enumerate(found) if len(seen.px) >= FEWEST_CORNERS]
-    for i in sorted(set(range(len(files))) - set(usable)):
+        turned = " as on the sensor (some are turned by 90 degrees)" if len({min(s) for s in sizes}) == 1 else ""
+        raise CaptureError(f"calibration photographs: sizes {listed}, needed one size{turned}; take out the others")
+    double = [i for i, (_, seen) in enumerate(found) if len(seen.twice) >= FEW_TWICE]
+    usable = [i for i, (_, seen) in enumerate(found) if len(seen.px) >= FEWEST_CORNERS and i not in double]
+    for i in double:
+        warnings.append(f"{files[i]}: {len(found[i][1].twice)} ids are seen twice, needed one board; left out")
+    for i in sorted(set(range(len(files))) - set(usable) - set(double)):
         seen = found[i][1]
         warnings.append(
             f"{files[i]}: {len(seen.px)} corners ({seen.markers} markers) found, needed {FEWEST_CORNERS}; left out"
         )
     if len(usable) < FEWEST_PHOTOS:
+        others = [read_grey(root / files[i]) for i in range(len(files)) if i not in usable and i not in double]
+        instead = board_doubts.of_board(others, facts["board"]) if others else ""
+        cover = "; cover all boards but one" if double else ""
         raise CaptureError(
-            f"calibration: {len(usable)} of {len(files)} photographs show the board, needed {FEWEST_PHOTOS}; check "
-            "[board] (dictionary, squares, legacy) and photograph the whole board sharply from several tilts"
+            f"calibration: {len(usable)} of {len(files)} photographs show the board, needed {FEWEST_PHOTOS}{cover}; "
+            + (instead or "check [board] (dictionary, squares, legacy)")
+            + "; photograph the whole board sharply from several tilts"
         )
     photos = Photos([files[i] for i in usable], [found[i][1].world_m for i in usable], [found[i][1].px for i in usable])
     return photos, next(iter(sizes))
@@ -186,9 +197,14 @@ def drop_bad(
     rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
     limit = GATE * max(float(np.median(rms)), scale)
     bad = [i for i in range(len(rms)) if rms[i] > limit]
-    for i in bad:
-        warnings.append(f"{photos.files[i]}: residual {rms[i]:.2f} px, others {np.median(rms):.2f} px; left out")
     rest = [i for i in range(len(rms)) if i not in bad]
+    if bad and len(rest) >= FEWEST_PHOTOS:
+        lens = fit_model(start, [fit.poses[i] for i in rest], photos.only(rest), ("k1", "k2")).camera
+    for i in bad:
+        why = ""
+        if len(rest) >= FEWEST_PHOTOS:
+            why = zoomed(lens, fit.poses[i], photos.world_m[i], photos.px[i], 2 * float(np.median(rms)))
+        warnings.append(f"{photos.files[i]}: residual {rms[i]:.2f} px, others {np.median(rms):.2f} px{why}; left out")
     if len(rest) < FEWEST_PHOTOS:
         raise CaptureError(
             f"calibration: {len(rest)} of {len(rms)} photographs agree with one lens, needed {FEWEST_PHOTOS}; is the "
@@ -199,6 +215,19 @@ def drop_bad(
     world_m = [points[keep] for points, keep in zip(photos.world_m, kept, strict=True)]
     px = [points[keep] for points, keep in zip(photos.px, kept, strict=True)]
     return Photos(photos.files, world_m, px), [fit.poses[i] for i in rest]
+
+
+def zoomed(camera: Camera, pose: np.ndarray, world_m: np.ndarray, px: np.ndarray, limit_px: float) -> str:
+    """What to say of a photograph (points (N, 3), pixels (N, 2)) that another focal length explains to ``limit_px``."""
+    best = (np.inf, 1.0)
+    for step in (0.04, 0.01):  # a coarse search of a factor between 0.6 and 1.65, then a fine one around it
+        for factor in best[1] * np.exp(step * np.arange(-12, 13)):
+            lens = camera.model_copy(update={"fx": camera.fx * factor, "fy": camera.fy * factor})
+            off = residuals_and_jacobian(lens, minimise(lens, pose, world_m, px), world_m, px)[0]
+            best = min(best, (float(np.sqrt((off**2).mean())), float(factor)))
+    if not (best[0] < limit_px and abs(best[1] - 1) > SAME_FOCAL):
+        return ""
+    return f"; it fits a focal length {best[1] - 1:+.0%} off: the zoom was moved"
 
 
 def fit_model(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> Adjustment:

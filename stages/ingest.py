@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from pipeline.camera.stated import read_pose
+from pipeline.camera.view_checks import lens_strangers, zoom_differs
 from pipeline.image.colour import convert
 from pipeline.image.exposure import exposure_of
 from pipeline.image.frames import read_frame
@@ -31,6 +33,7 @@ from pipeline.image.raw import file_sha256
 from pipeline.image.sensitivities import is_known
 from pipeline.image.sensor import missing, read_bad_pixels, restated
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, OCCLUDERS, PROXIES, VIEW_PHOTOS, WISHES
+from pipeline.run.camera_facts import CAMERA_SUFFIXES
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_latlong, read_linear, read_mask
 from pipeline.run.manifest import (
@@ -67,11 +70,13 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     warnings: list[str] = []
     scene = scene_file or next((f for f in [manifest.parent / DEFAULT_SCENE] if f.is_file()), None)
     wishes = _wishes(scene, root, problems)
-    board = _board_photos(facts, root, manifest, problems)
+    board, board_frames = _board_photos(facts, root, manifest, problems, flaws)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
+    _check_zoom(brackets, board_frames, flaws, warnings)
     dumped["probe"] |= _probe_files(facts, root, manifest, problems, flaws)
     view_photos = _view_photos(facts, root, manifest, problems, flaws)
+    dumped["pose"] = _poses(facts, root, manifest, problems)
     proxies = _proxies(facts, root, manifest, problems, warnings)
     occluders = _occluders(facts, root, manifest, _size(brackets), problems, warnings)
     _check_references(facts, manifest, brackets, problems)
@@ -117,15 +122,27 @@ def _wishes(scene: Path | None, root: Path, problems: list[str]) -> dict[str, An
     return dumped
 
 
-def _board_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str]) -> list[dict[str, str]]:
+def _board_photos(
+    facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]
+) -> tuple[list[dict[str, str]], dict[str, list[Frame]]]:
+    """Board photographs of every camera, and their frames by view: one lens and focal length each, as they say."""
     cameras = {"plate": ("camera", facts.camera)}
     cameras |= {b.name: (f"ball[{i}].camera", b.camera) for i, b in enumerate(facts.ball) if b.camera is not None}
-    photos = []
+    photos: list[dict[str, str]] = []
+    taken: dict[str, list[Frame]] = {}
     for view, (key, camera) in cameras.items():
         files, found = resolve_files(camera.calibration, root, f"{manifest}: {key}.calibration")
         problems.extend(found)
-        photos += [{"file": f.relative_to(root).as_posix(), "sha256": file_sha256(f), "view": view} for f in files]
-    return photos
+        frames = []
+        for file in files:
+            try:
+                frames.append(read_frame(file, file.relative_to(root).as_posix()))
+            except CaptureError as error:
+                flaws.append(str(error))
+        flaws.extend(lens_strangers(frames, "board photographs"))
+        taken[view] = frames
+        photos += [{"file": frame.file, "sha256": frame.sha256, "view": view} for frame in frames]
+    return photos, taken
 
 
 def _view_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str], flaws: list[str]) -> list[Frame]:
@@ -140,7 +157,24 @@ def _view_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list
             frames.append(read_frame(file, file.relative_to(root).as_posix()))
         except CaptureError as error:
             flaws.append(str(error))
+    flaws.extend(lens_strangers(frames, "further views"))
     return frames
+
+
+def _poses(facts: CaptureFacts, root: Path, manifest: Path, problems: list[str]) -> list[dict[str, Any]]:
+    """The [[pose]] tables, those that name a file with its camera as world_from_camera."""
+    tables = []
+    for number, table in enumerate(facts.pose):
+        tables.append(table.model_dump(mode="json"))
+        where = f"{manifest}: pose[{number}].file"
+        path = table.file and _found(table.file, [manifest.parent, root], where, CAMERA_SUFFIXES, problems)
+        if path:
+            try:
+                pose = read_pose(path, table.frame, table.rotation_order, table.unit_m, table.prim)
+                tables[-1]["world_from_camera"] = pose.tolist()
+            except ManifestError as error:
+                problems.append(f"{where}: {error}")
+    return tables
 
 
 def _probe_files(
@@ -433,6 +467,26 @@ def _check_sizes(brackets: dict[str, Bracket], own: set[str], flaws: list[str], 
                     f"{name}: taken with {models[0] or 'an unnamed camera'}, the plate with {reference.camera or 'one'}"
                     "; the plate's lens is taken for both; state [[ball]] camera if it had another"
                 )
+
+
+def _check_zoom(
+    brackets: dict[str, Bracket], board_frames: dict[str, list[Frame]], flaws: list[str], warnings: list[str]
+) -> None:
+    """One focal length within a view, in its board photographs, and in views that share the plate's lens."""
+    for name, bracket in brackets.items():
+        own, plate = board_frames.get(name), brackets["plate"].frames
+        if len({frame.camera for frame in bracket.frames}) == 1:  # several are refused already
+            flaws.extend(lens_strangers(bracket.frames, f"frames of {name}"))
+        if own and (mm := zoom_differs(bracket.frames, own)):
+            flaws.append(
+                f"{name}: taken at {mm[0]:g} mm, its board photographs at {mm[1]:g} mm; needed one focal length; "
+                "photograph the board again with the zoom as it was"
+            )
+        elif name not in board_frames and bracket.role == "ball" and (mm := zoom_differs(plate, bracket.frames)):
+            warnings.append(
+                f"{name}: taken at {mm[1]:g} mm, the plate at {mm[0]:g} mm; the plate's lens is taken for both; state "
+                "[[ball]] camera"
+            )
 
 
 STAGE = Stage(

@@ -19,8 +19,9 @@ from pipeline.camera.colmap_bridge import reconstruct
 from pipeline.camera.markers import grey, tone
 from pipeline.camera.opencv_bridge import read_grey
 from pipeline.camera.sfm import camera_start
+from pipeline.camera.view_checks import only_turned, parallax_deg
 from pipeline.run.artifacts import BRACKETS, FACTS, PHOTOGRAPHS, RECONSTRUCTION, VIEW_PHOTOS
-from pipeline.run.errors import CaptureError
+from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Result
 from stages import knobs
@@ -52,6 +53,8 @@ def compute(
                 f"{photo.file}: decodes to {found}, metadata say {photo.width}x{photo.height}; copy again"
             )
     made = reconstruct(pictures, bodies, cameras, params.method, min(os.cpu_count() or 1, 8))
+    if turned := only_turned(made):
+        raise NumericalError(turned)
     warnings = [
         f"{name}: shares too little with the other photographs to be oriented; take it nearer to one of them"
         for name in made.missing
@@ -64,7 +67,9 @@ def compute(
     lengths = np.bincount(made.seen_point)
     numbers = {
         "method": made.method, "photos": len(made.names), "missing": made.missing, "points": len(made.points),
-        "sightings": len(made.px), "median_track": float(np.median(lengths)), "focal_px": [c.fx for c in made.cameras],
+        "sightings": len(made.px),
+        "parallax_deg": parallax_deg(made), "median_track": float(np.median(lengths)),
+        "focal_px": [c.fx for c in made.cameras],
     }  # fmt: skip
     term = {
         "term": "further views", "modelled": True,

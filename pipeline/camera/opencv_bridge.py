@@ -23,12 +23,17 @@ SMALLEST_WINDOW, LARGEST_WINDOW = 2, 11  # half size of the window of a corner, 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Points of known place found in a picture: world (N, 3) m, pixels (N, 2), ids (N,), and the markers seen."""
+    """Points of known place found in a picture: world (N, 3) m, pixels (N, 2), ids (N,), and the markers seen.
+
+    ``twice``: ids of markers that are seen in two places; ``note``: what is shown instead of what was looked for.
+    """
 
     world_m: np.ndarray
     px: np.ndarray
     ids: np.ndarray
     markers: int
+    twice: tuple[int, ...] = ()
+    note: str = ""
 
 
 def ours(opencv_px: np.ndarray) -> np.ndarray:
@@ -108,16 +113,24 @@ def board_sightings(
         K[:2, 2] -= HALF_PIXEL
         options.cameraMatrix, options.distCoeffs = K, np.asarray(camera.distortion, float)
     made = charuco_board(board)
-    corners, ids, _, marker_ids = cv2.aruco.CharucoDetector(made, options).detectBoard(small)
+    corners, ids, quads, marker_ids = cv2.aruco.CharucoDetector(made, options).detectBoard(small)
     markers = 0 if marker_ids is None else len(marker_ids)
+    twice = () if marker_ids is None else repeated(np.reshape(quads, (-1, 4, 2)), np.ravel(marker_ids))
     if ids is None or len(ids) < 4:
-        return Sightings(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, int), markers)
+        return Sightings(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, int), markers, twice)
     ids = np.asarray(ids).ravel()
     flat = np.asarray(made.getChessboardCorners(), float).reshape(-1, 3)
     marker_corners = np.concatenate([np.asarray(m, float).reshape(-1, 3) for m in made.getObjPoints()])
     rough = ours(corners) * step
     px = refined_corners(precise, flat[ids], rough, marker_corners)
-    return Sightings(transform_points(WORLD_FROM_BOARD, flat[ids]), px, ids, markers)
+    return Sightings(transform_points(WORLD_FROM_BOARD, flat[ids]), px, ids, markers, twice)
+
+
+def repeated(quads: np.ndarray, ids: np.ndarray) -> tuple[int, ...]:
+    """Ids of markers (N, 4, 2) px that are seen in two places, more than a side apart; sorted."""
+    centres, sides = quads.mean(1), np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).mean(1)
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1) > np.minimum(sides[:, None], sides[None])
+    return tuple(sorted({int(i) for i in ids[((ids[:, None] == ids[None]) & apart).any(1)]}))
 
 
 def refined_corners(

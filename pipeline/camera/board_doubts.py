@@ -1,0 +1,135 @@
+"""Why a board or marker is not what the manifest says: each answer is half a line that ends an error or a warning.
+
+Looked at only once something has failed, as the search over all families of markers costs ten times what one does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera.board_families import Layout, find_markers, layout_of
+from pipeline.camera.lens import project, unproject
+from pipeline.camera.rigid import camera_points
+from pipeline.conventions import WORLD_FROM_BOARD, transform_points
+from pipeline.types import Camera
+
+FEW = 4  # markers: fewer may be texture that reads as one
+LOOKED_AT = 3  # pictures
+SQUARE = 0.02  # how far the sides of a marker that lies on the plane differ, of their mean
+SIZE_TOLERANCE = 0.01  # what printers do
+CORNER_PX = 0.1
+CUT = 0.02  # of the board's outline outside the frame
+
+
+def of_board(pictures: Sequence[np.ndarray], board: dict[str, Any]) -> str:
+    """What pictures (H, W) uint8 show instead of the stated ChArUco board; empty when it is that board, or nothing."""
+    pictures = list(pictures)[:LOOKED_AT]
+    layout = layout_of([find_markers(picture) for picture in pictures])
+    if layout is None or len(layout.ids) < FEW:
+        return _mirrored(pictures)
+    if layout.name and layout.name != board.get("layout"):
+        return f'its markers are those of insitu board: [board] layout = "{layout.name}"'
+    if layout.kind == "charuco" and not _is_stated(layout, board):
+        return f"what it shows fits {_spelled(layout)}"
+    if layout.kind in ("grid", "unknown") and not _same_family(layout, board["dictionary"]):
+        return f"its markers are of {layout.dictionary}, [board] says {board['dictionary']}"
+    return ""
+
+
+def of_marker(picture: np.ndarray, marker: dict[str, Any]) -> str:
+    """What a picture (H, W) uint8 shows instead of the stated marker; empty when nothing can be said."""
+    seen = find_markers(picture)
+    if not len(seen.ids):
+        return _mirrored([picture])
+    layout = layout_of([seen])
+    assert layout is not None
+    if _same_family(layout, marker["dictionary"]) and marker["id"] in layout.ids:
+        return ""
+    ids = ", ".join(str(i) for i in layout.ids[:6]) + (", ..." if len(layout.ids) > 6 else "")
+    return f"it shows {layout.dictionary}, id {ids}; [marker] says {marker['dictionary']}, id {marker['id']}"
+
+
+def _mirrored(pictures: Sequence[np.ndarray]) -> str:
+    """Whether markers are read in the mirror image, as no marker is in its own."""
+    best = max((find_markers(np.ascontiguousarray(picture[:, ::-1])) for picture in pictures), key=lambda m: len(m.ids))
+    if not len(best.ids):
+        return ""
+    return (
+        f"{len(best.ids)} markers of {best.family} are read in its mirror image: the print or the photograph is "
+        "mirrored (a front camera, a film print); flip it back or print the board again"
+    )
+
+
+def _same_family(layout: Layout, name: str) -> bool:
+    """Dictionaries of one family share their first markers."""
+    return layout.dictionary.rpartition("_")[0] == name.rpartition("_")[0]
+
+
+def _is_stated(layout: Layout, board: dict[str, Any]) -> bool:
+    same = layout.squares == tuple(board["squares"]) and layout.first_id == board.get("first_id", 0)
+    legacy = layout.squares[1] % 2 or layout.legacy == bool(board.get("legacy", False))  # alike with odd rows
+    return bool(same and legacy and _same_family(layout, board["dictionary"]))
+
+
+def _spelled(layout: Layout) -> str:
+    legacy = ", legacy = true" if layout.legacy else ""
+    return f'dictionary = "{layout.dictionary}", squares = [{layout.squares[0]}, {layout.squares[1]}]{legacy}'
+
+
+def outside_frame(camera: Camera, pose: np.ndarray, board: dict[str, Any]) -> float:
+    """Share of the board's outline that the frame does not show; ``pose`` (4, 4) is ``world_from_camera``."""
+    across, down = np.array(board["squares"]) * board["square_m"]
+    t = np.linspace(0, 1, 25)[:, None]
+    corners = np.array([[0, 0, 0], [across, 0, 0], [across, down, 0], [0, down, 0]])
+    outline = np.concatenate([a + t * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
+    px = project(camera, camera_points(pose, transform_points(WORLD_FROM_BOARD, outline))[0])
+    shown = np.isfinite(px).all(-1) & (px >= 0).all(-1) & (px <= (camera.width, camera.height)).all(-1)
+    return float(1 - shown.mean())
+
+
+def cut(camera: Camera, pose: np.ndarray, board: dict[str, Any], corners: int) -> str:
+    """What to say of a board that reaches out of the frame; empty when the frame holds it."""
+    outside = outside_frame(camera, pose, board)
+    total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
+    if outside <= CUT:
+        return ""
+    return (
+        f"{outside:.0%} of the board's outline is out of the frame, {corners} of {total} corners are used; show all of "
+        "it for the smallest uncertainty"
+    )
+
+
+def side_on_plane(camera: Camera, pose: np.ndarray, corners_px: np.ndarray) -> tuple[float, float] | None:
+    """Side (m) and its standard uncertainty of a marker (4, 2) px that lies on y = 0; None when it does not lie there.
+
+    Seen on the plane its outline must be a square: a marker that stands or lies higher is none.
+    """
+    rays = np.concatenate([unproject(camera, corners_px), np.ones((4, 1))], -1) @ pose[:3, :3].T
+    if not np.isfinite(rays).all() or (rays[:, 1] >= 0).any():
+        return None
+    spots = pose[:3, 3] - rays * (pose[1, 3] / rays[:, 1])[:, None]
+    sides = np.linalg.norm(spots - np.roll(spots, 1, 0), axis=1)
+    diagonals = np.linalg.norm(spots[:2] - spots[2:], axis=1) / np.sqrt(2)
+    side = float(sides.mean())
+    px = np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1)
+    sigma = CORNER_PX * side / float(px.min())
+    uneven = float(np.abs(np.concatenate([sides, diagonals]) - side).max())
+    return (side, sigma) if uneven < max(SQUARE * side, 4 * sigma) else None
+
+
+def wrong_size(marker: dict[str, Any], measured: tuple[float, float], unit: str) -> str:
+    """What to say of a marker whose side is not as stated in the world's unit; empty when it is.
+
+    ``measured``: side and uncertainty of `side_on_plane`; ``unit``: what gives the world's size, in words.
+    """
+    side, sigma = measured
+    ratio = side / marker["side_m"]
+    if abs(ratio - 1) < max(SIZE_TOLERANCE, 4 * sigma / marker["side_m"]):
+        return ""
+    return (
+        f"marker {marker['id']}: its side is {1000 * side:.1f} mm by the {unit}, side_m says "
+        f"{1000 * marker['side_m']:.1f} mm ({ratio - 1:+.1%}); measure both prints"
+    )
