@@ -122,6 +122,9 @@ class Camera(Record):
     covariance: Array = np.zeros((9, 9))  # of (fx, fy, cx, cy, k1, k2, p1, p2, k3), px and 1
     rms_px: float = 0.0
     source: str = "given"
+    body: str = ""  # with lens and focal_mm: what metadata say of the optics that this is the camera of; "", 0: unknown
+    lens: str = ""
+    focal_mm: float = 0.0
 
     @property
     def K(self) -> np.ndarray:

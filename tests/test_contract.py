@@ -76,7 +76,7 @@ BRIDGES = {
         "pipeline/simulation/spectra.py",
     },
     "reportlab": {"pipeline/capture/sheet.py"},
-    "lensfunpy": {"pipeline/image/vignetting.py"},
+    "lensfunpy": {"pipeline/image/lens_database.py"},
     "colour_demosaicing": {"pipeline/image/demosaic.py"},
     "flip_evaluator": {"pipeline/image/metrics.py"},
     "skimage": {"pipeline/image/metrics.py"},

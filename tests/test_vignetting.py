@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from pipeline.image import lens_database
 from pipeline.image import vignetting as v
 from pipeline.run.errors import CaptureError
 from pipeline.types import Raster
@@ -96,15 +97,15 @@ def test_the_files_own_word():
 def test_a_lens_database():
     """lensfun's own numbers (Canon EF 24-105 at 24 mm): brighter towards the corners, less so stopped down."""
     pytest.importorskip("lensfunpy")
-    wide = v.lensfun_gain("Canon EOS 5D Mark III", "EF24-105mm f/4L IS USM", 24, 4, 200, 300)
-    stopped = v.lensfun_gain("Canon EOS 5D Mark III", "EF24-105mm f/4L IS USM", 24, 11, 200, 300)
+    wide = lens_database.vignetting_gain("Canon EOS 5D Mark III", "EF24-105mm f/4L IS USM", 24, 4, 200, 300)
+    stopped = lens_database.vignetting_gain("Canon EOS 5D Mark III", "EF24-105mm f/4L IS USM", 24, 11, 200, 300)
     assert wide is not None
     assert stopped is not None
     assert wide[1] == "Canon EF 24-105mm f/4L IS USM"
     assert wide[0][100, 150] == pytest.approx(1, abs=1e-4)
     assert wide[0][0, 0] > stopped[0][0, 0] > 1.2
-    assert v.lensfun_gain("No Such Camera", "EF24-105mm f/4L IS USM", 24, 4, 200, 300) is None
-    assert v.lensfun_gain("Canon EOS 5D Mark III", "", 24, 4, 200, 300) is None
+    assert lens_database.vignetting_gain("No Such Camera", "EF24-105mm f/4L IS USM", 24, 4, 200, 300) is None
+    assert lens_database.vignetting_gain("Canon EOS 5D Mark III", "", 24, 4, 200, 300) is None
 
 
 # the stage

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import CLIPPED, HOT
+from pipeline.image.lens_database import vignetting_gain
 from pipeline.run.errors import CaptureError
 from pipeline.types import Raster
 
@@ -26,7 +27,6 @@ BLOCKS = 64  # along the longer side
 POWERS = (2, 4, 6)
 ROBUST = 5.0
 MODEL_SIGMA = 0.001  # relative, at the corner: what three terms leave of a lens whose rim is in the way
-FAR_M = 1000.0  # distance lensfun is asked for
 TABLE = 2049  # radii of a tabulated gain
 
 
@@ -149,34 +149,6 @@ def radial_gain(parameters: np.ndarray, height: int, width: int) -> np.ndarray:
     return (1 + squared * np.polynomial.polynomial.polyval(squared, k)).astype(np.float32)
 
 
-def lensfun_gain(
-    camera: str, lens: str, focal_mm: float, fnumber: float, height: int, width: int
-) -> tuple[np.ndarray, str] | None:
-    """(H, W) float32 gain and the lens as lensfun names it; None unless camera, lens and its vignetting are there."""
-    if not camera or not lens or not focal_mm > 0 or not fnumber > 0:
-        return None
-    import lensfunpy
-
-    database = lensfunpy.Database()
-    bodies = [
-        body
-        for body in database.cameras
-        if camera.lower() in (body.model.lower(), f"{body.maker} {body.model}".lower())
-    ]
-    if not bodies:
-        return None
-    found = sorted(database.find_lenses(bodies[0], None, lens), key=lambda one: -one.score)
-    found = [one for one in found if one.min_focal * 0.95 <= focal_mm <= one.max_focal * 1.05]
-    if not found or (len(found) > 1 and found[1].score == found[0].score):
-        return None
-    modifier = lensfunpy.Modifier(found[0], bodies[0].crop_factor, width, height)
-    modifier.initialize(focal_mm, fnumber, FAR_M, pixel_format=np.float32, flags=lensfunpy.ModifyFlags.VIGNETTING)
-    picture = np.ones((height, width, 3), np.float32)
-    if not modifier.apply_color_modification(picture):
-        return None
-    return np.ascontiguousarray(picture[..., 1]), found[0].model
-
-
 class Losses:
     """Which loss is undone in which view, and what is said of it.
 
@@ -225,7 +197,7 @@ class Losses:
         if optics.get("vignetting") is not None:
             return radial_gain(np.array(optics["vignetting"], float), *shape), None, "FixVignetteRadial of the file"
         name = optics.get("lens") or (self.facts.get("name") if profile["camera"] == self.plate["camera"] else "") or ""
-        known = lensfun_gain(profile["camera"], name, optics.get("focal_mm", 0), optics.get("fnumber", 0), *shape)
+        known = vignetting_gain(profile["camera"], name, optics.get("focal_mm", 0), optics.get("fnumber", 0), *shape)
         return None if known is None else (known[0], None, f"lensfun, {known[1]}")
 
     def corrected(self, merged: Raster, profile: dict[str, Any]) -> Raster:
