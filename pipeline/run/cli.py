@@ -66,6 +66,9 @@ def build_parser() -> argparse.ArgumentParser:
     verb("summary", "print results, errors against truth and seconds per stage")
     maps = verb("stmap", closure.summary("stages.stmap"))
     maps.add_argument("--to", type=Path, help="folder of the maps (default: stmap in the build folder)")
+    told = verb("needs", "say what was modelled and what was not, on what evidence, and what that could cost")
+    told.add_argument("--json", action="store_true", help="print it as JSON")
+    _trading(verb("trade", "measure what speed costs in accuracy: every knob alone, presets, combinations"))
     verb("verify", "recompute the digest of every file of a build")
     for name in stage_names():
         sub = verb(name, closure.summary(f"stages.{name}"))
@@ -110,6 +113,18 @@ def _scoring(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--with-truth", metavar="NAMES", help="put truth in place of camera,pose,probe,albedo: where error is"
     )
+
+
+def _trading(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--scene", type=Path, help="scene.toml (default: the one beside capture.toml)")
+    sub.add_argument("--knobs", metavar="A.B,C.D", help="try these alone (default: all that have a ladder)")
+    sub.add_argument("--set", action="append", default=[], metavar="STAGE.KNOB=VALUE", help="at every point")
+    sub.add_argument("--quality", choices=["draft", "preview", "final"], default="preview", help="base (preview)")
+    sub.add_argument("--repeats", type=int, default=2, help="further runs of the base, for the error bar (2)")
+    sub.add_argument("--against", choices=["truth", "final"], default="", help="default: truth where there is one")
+    sub.add_argument("--no-presets", action="store_true", help="leave the other presets out")
+    sub.add_argument("--no-design", action="store_true", help="leave combinations out")
+    sub.add_argument("--reuse", action="store_true", help="take finished stages of the build, and their seconds")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -195,7 +210,34 @@ def dispatch(args: argparse.Namespace) -> int:
         scores = score_files(args.capture, args.composite, args.plate, args.probe, out_of(args))
         say(json.dumps(scores, indent=1))
         return 0
+    if args.verb == "trade":
+        return trading(args)
     return with_build(args)
+
+
+def trading(args: argparse.Namespace) -> int:
+    """Measure the trade of a capture."""
+    from pipeline.run.settings import resolve
+    from pipeline.trade.points import chosen_knobs
+    from stages.knobs import KNOBS, PRESETS
+
+    if args.repeats < 0:
+        raise ManifestError(f"--repeats: is {args.repeats}; expected 0 or more")
+
+    def settle(quality: str, switches: list[str]) -> Settings:
+        return resolve(args.capture, args.scene, quality, [*args.set, *switches], KNOBS, PRESETS)
+
+    knobs = chosen_knobs(args.knobs)
+    settle(args.quality, [])
+    from pipeline.trade.trade import Asked, trade
+    from stages.order import graph
+
+    asked = Asked(
+        out_of(args), settle, graph(), KNOBS, args.quality, knobs, args.repeats, not args.no_presets,
+        not args.no_design, args.reuse, args.against,
+    )  # fmt: skip
+    trade(asked, say)
+    return 0
 
 
 def out_of(args: argparse.Namespace) -> Path:
@@ -267,6 +309,12 @@ def with_build(args: argparse.Namespace) -> int:
     build = Build(graph(), out, chosen, KNOBS)
     if args.verb == "summary":
         say(print_summary(build))
+        return 0
+    if args.verb == "needs":
+        from pipeline.run.needs import as_text, needs
+
+        found = needs(build)
+        say(json.dumps(found, indent=1) if args.json else as_text(found, build))
         return 0
     if args.verb == "verify":
         problems = build.verify()

@@ -1,0 +1,1 @@
+"""Speed against accuracy, measured: every knob alone, presets, and designed combinations."""
