@@ -31,10 +31,17 @@ class PlateFacts(Strict):
 
 
 class CameraFacts(Strict):
-    """Where the intrinsics come from: board photographs, or given numbers (pixel origin of conventions)."""
+    """Where the intrinsics come from: board photographs, given numbers (pixel origin of conventions), or a camera.json."""
 
     calibration: list[str] = Field([], description="board photographs, files or globs")
     given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
+    file: str | None = Field(None, description="camera.json of a former build, same optics; relative to capture.toml")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> CameraFacts:
+        if self.file is not None and (self.calibration or self.given is not None):
+            raise ValueError("file: a former calibration stands alone; drop it, or calibration and given")
+        return self
 
 
 class BallFacts(Strict):
@@ -50,8 +57,8 @@ class BallFacts(Strict):
     def _one_camera(self) -> BallFacts:
         if self.camera is not None and self.tripod:
             raise ValueError("tripod = true says the plate's camera in its place, camera another one; drop one of them")
-        if self.camera is not None and not self.camera.calibration and self.camera.given is None:
-            raise ValueError("camera: neither calibration photographs nor given numbers")
+        if self.camera is not None and not (self.camera.calibration or self.camera.given or self.camera.file):
+            raise ValueError("camera: neither calibration photographs nor given numbers, nor a former camera's file")
         return self
 
 
@@ -143,6 +150,8 @@ class ReferenceFacts(Strict):
     kind: Literal["grey_card", "white_card", "chart", "grey_ball"]
     reflectance: tuple[Share, Share, Share] | None = Field(None, description="linear RGB; without it, neutral")
     reflectance_space: Literal["acescg", "linear_rec709"] = "acescg"
+    on_plane: bool | None = Field(None, description="lies flat on the plane; without it, where its outline says so")
+    size_mm: tuple[Length, Length] | None = Field(None, description="first side and second: how a card is tilted")
     seen: list[SeenFacts] = Field(min_length=1, description="one table per view that shows it")
 
     @model_validator(mode="after")
@@ -156,6 +165,8 @@ class ReferenceFacts(Strict):
             raise ValueError("corners_px: expected a chart's four corners: dark skin, bluish green, black, white")
         if len({len(seen.corners_px) == 4 for seen in self.seen}) > 1:
             raise ValueError("corners_px: four corners in one view, another outline in another; expected one kind")
+        if self.size_mm and (self.kind == "grey_ball" or len(self.seen[0].corners_px) != 4):
+            raise ValueError("size_mm: is for a card with four corners; take it out")
         if self.reflectance is not None and min(self.reflectance) <= 0:
             raise ValueError(f"reflectance is {self.reflectance}; expected three numbers above 0")
         return self
@@ -220,8 +231,6 @@ class CaptureFacts(Strict):
             given = [table.name for table in tables]
             if len(set(given)) < len(given):
                 raise ValueError(f"{kind} names are {given}; each must be unique")
-        if not self.camera.calibration and self.camera.given is None and self.views is None:
-            raise ValueError("camera: neither calibration photographs, given numbers nor [views]")
         marks = [(marker.dictionary, marker.id) for marker in self.marker]
         if len(set(marks)) < len(marks):
             raise ValueError(f"marker ids are {[mark[1] for mark in marks]}; each must be unique")
