@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera import board_doubts
 from pipeline.camera.lens import project
 from pipeline.camera.marker_map import MarkerMap, residuals_of, with_tripod
 from pipeline.camera.markers import grey
@@ -27,7 +28,7 @@ from pipeline.camera.opencv_bridge import Sightings, read_grey
 from pipeline.camera.resection import Resection, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.camera.sfm import Seen, oriented, scale_sigma, scaled_covariance
-from pipeline.camera.sights import FEWEST_CORNERS, marks_in, sighted_board, sighted_marker
+from pipeline.camera.sights import FEWEST_CORNERS, marks_in
 from pipeline.camera.stated import rigid
 from pipeline.camera.survey import resect_points
 from pipeline.image.colour import decode_srgb
@@ -101,12 +102,10 @@ def compute(
     numbers = {
         name: figures(name, view, estimates.get(name), sights.get(name), warnings) for name, view in views.items()
     }
+    warnings += board_doubts.of_prints(facts, views, sights, grey(photographs["plate"].rgb()), cameras["plate"])
     for name, shift in {**shifts, **places.pop("tripod_shift_px", {})}.items():
         numbers[name]["tripod_shift_px"] = shift
-    if extra:
-        numbers["sfm"] = extra
-    if places:
-        numbers["marker_map"] = places
+    numbers |= {key: part for key, part in (("sfm", extra), ("marker_map", places)) if part}
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
     return Result({"views": result}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
@@ -222,10 +221,7 @@ def by_map(
         views[name] = view_of(estimates[name])
     for name, (chi2, shift) in moved.items():
         if name in views:
-            warnings.append(
-                f"{name}: the tripod moved: markers shifted by {shift:.2f} px (chi2 {chi2:.0f}, expected below "
-                f"{MOVED_CHI2:.0f}); its own pose is used"
-            )
+            warnings.append(moved_by(name, "markers", shift, chi2))
     for name in here:
         if name not in views and "plate" in views:
             views[name] = views["plate"].model_copy(update={"route": "same_as"})
@@ -298,11 +294,8 @@ def check_sizes(photographs: dict[str, Raster], cameras: dict[str, Camera]) -> N
 
 def sight(facts: dict[str, Any], name: str, order: dict[str, Any], photograph: Raster, camera: Camera) -> Sightings:
     """Corners of the board, or the four corners of the marker, in one view."""
-    radiance = grey(photograph.rgb())
-    if order["route"] == "charuco":
-        return sighted_board(radiance, facts["board"], camera)
     try:
-        return sighted_marker(radiance, facts["marker"][0], camera)
+        return board_doubts.sighted(facts, order["route"], grey(photograph.rgb()), camera)
     except CaptureError as error:
         raise CaptureError(f"{name}: {error}") from error
 
@@ -322,8 +315,8 @@ def estimate_view(
         if len(seen.px) < needed:
             raise CaptureError(
                 f"{len(seen.px)} corners of the {'marker' if route == 'marker' else 'board'} found ({seen.markers} "
-                f"markers read), needed {needed}; check dictionary, id and legacy in the manifest, or photograph it "
-                "unobstructed, sharp and larger in the frame, or orient the view by a [[pose]] entry"
+                f"markers read), needed {needed}; {seen.note or 'check dictionary, id and legacy in the manifest'}, or "
+                "photograph it unobstructed, sharp and larger in the frame, or orient the view by a [[pose]] entry"
             )
         best, second, ambiguity = resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px)
         estimate = Estimate(route, seen, best, second, ambiguity)
@@ -415,10 +408,7 @@ def settle_tripod(
         if chi2 <= MOVED_CHI2:
             pool.append(Sightings(seen.world_m[own.kept], seen.px[own.kept], seen.ids[own.kept], seen.markers))
             continue
-        warnings.append(
-            f"{name}: the tripod moved: board shifted by {shifts[name]:.2f} px (chi2 {chi2:.0f}, expected below "
-            f"{MOVED_CHI2:.0f}); its own pose is used"
-        )
+        warnings.append(moved_by(name, "board", shifts[name], chi2))
         estimates[name] = Estimate(plate.route, seen, own, None, np.inf)
         views[name] = view_of(estimates[name])
     if plate is not None and pool:
@@ -431,6 +421,14 @@ def settle_tripod(
         if name not in views:
             views[name] = views["plate"].model_copy(update={"route": "same_as"})
     return shifts
+
+
+def moved_by(name: str, what: str, shift_px: float, chi2: float) -> str:
+    """The warning that a tripod view is not where the plate was taken."""
+    return (
+        f"{name}: the tripod moved: {what} shifted by {shift_px:.2f} px (chi2 {chi2:.0f}, expected below "
+        f"{MOVED_CHI2:.0f}); its own pose is used"
+    )
 
 
 def averaged(sightings: list[Sightings]) -> Sightings:
@@ -475,7 +473,7 @@ def figures(
     far_m = float(np.linalg.norm(view.world_from_camera[:3, 3]))
     if far_m > FAR_M:
         warnings.append(
-            f"{name}: the camera is {far_m:.3g} m from the origin, needed below {FAR_M:g} for objects to be rendered to "
+            f"{name}: the camera is {far_m:.3g} m from the origin, needed below {FAR_M:g} to render to "
             "a millimetre; take a common offset off all world_m"
         )
     if view.rms_px > LARGE_RMS_PX:

@@ -6,17 +6,23 @@ Looked at only once something has failed, as the search over all families of mar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera.board_families import Layout, find_markers, layout_of
 from pipeline.camera.lens import project, unproject
+from pipeline.camera.markers import tone
+from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.rigid import camera_points
+from pipeline.camera.sights import FEWEST_CORNERS, eight_bit, sighted_board, sighted_marker
 from pipeline.conventions import WORLD_FROM_BOARD, transform_points
-from pipeline.types import Camera
+from pipeline.run.errors import CaptureError
+from pipeline.types import Camera, View
 
 FEW = 4  # markers: fewer may be texture that reads as one
+TWICE = 2  # ids: one may be texture that reads as a marker
 LOOKED_AT = 3  # pictures
 SQUARE = 0.02  # how far the sides of a marker that lies on the plane differ, of their mean
 SIZE_TOLERANCE = 0.01  # what printers do
@@ -50,6 +56,47 @@ def of_marker(picture: np.ndarray, marker: dict[str, Any]) -> str:
         return ""
     ids = ", ".join(str(i) for i in layout.ids[:6]) + (", ..." if len(layout.ids) > 6 else "")
     return f"it shows {layout.dictionary}, id {ids}; [marker] says {marker['dictionary']}, id {marker['id']}"
+
+
+def sighted(facts: dict[str, Any], route: str, radiance: np.ndarray, camera: Camera) -> Sightings:
+    """Corners of the stated board or first marker in linear radiance (H, W), with a note on what is shown instead.
+
+    ``route``: charuco or marker. Raises CaptureError for a board or marker that is seen twice.
+    """
+    if route == "marker":
+        marker = facts["marker"][0]
+        seen = sighted_marker(radiance, marker, camera)
+        return seen if len(seen.px) else replace(seen, note=of_marker(eight_bit(tone(radiance)), marker))
+    seen = sighted_board(radiance, facts["board"], camera)
+    if len(seen.twice) >= TWICE:
+        ids = ", ".join(str(i) for i in seen.twice[:4]) + (", ..." if len(seen.twice) > 4 else "")
+        raise CaptureError(f"ids {ids} are seen twice, needed one board; cover the other or take it away")
+    if len(seen.px) >= FEWEST_CORNERS:
+        return seen
+    return replace(seen, note=of_board([eight_bit(tone(radiance))], facts["board"]))
+
+
+def of_prints(
+    facts: dict[str, Any], views: dict[str, View], sights: dict[str, Sightings], plate: np.ndarray, camera: Camera
+) -> list[str]:
+    """What to say of boards that the frame cuts, and of markers beside the board whose size is another than stated.
+
+    ``plate``: its linear radiance (H, W). Only markers that lie on the board's plane are measured.
+    """
+    board, view, said = facts.get("board"), views["plate"], []
+    if not board or view.route != "charuco":
+        return []
+    if "plate" in sights and (text := cut(camera, view.world_from_camera, board, len(sights["plate"].px))):
+        said.append(f"plate: {text}")
+    for marker in facts.get("marker") or []:
+        try:
+            px = sighted_marker(plate, marker, camera).px
+        except CaptureError:
+            continue  # not measurable here, and not needed
+        measured = side_on_plane(camera, view.world_from_camera, px) if len(px) == 4 else None
+        if measured and (text := wrong_size(marker, measured, "board")):
+            said.append(f"plate: {text}")
+    return said
 
 
 def _mirrored(pictures: Sequence[np.ndarray]) -> str:
