@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.camera.adjustment import with_lens
-from pipeline.camera.lens import project_jacobians
+from pipeline.camera.lens import project, project_jacobians
 from pipeline.camera.rigid import camera_points, perturb, skew
 from pipeline.conventions import transform_points
 from pipeline.run.errors import NumericalError
@@ -107,6 +107,7 @@ class _Terms:
 def adjust(
     bundle: Bundle, free: list[np.ndarray] | None = None, prior: list[np.ndarray] | None = None,
     hold_first: bool = False, corner_sigma_px: float | None = None,
+    like: Adjusted | None = None,
 ) -> Adjusted:  # fmt: skip
     """Least squares from a start.
 
@@ -116,6 +117,7 @@ def adjust(
         prior: (9,) standard uncertainty of each lens's start; infinite where nothing is known.
         hold_first: hold the first pose and the distance of the farthest other: for a cloud without markers.
         corner_sigma_px: of a marker's corner; estimated when None and there are enough of them.
+        like: take noise and outliers from this fit of the same sightings, so that two models can be compared.
 
     Raises NumericalError when the sightings do not fix the unknowns.
     """
@@ -131,10 +133,12 @@ def adjust(
     anchor = _anchor(bundle) if hold_first else None
     used = (np.bincount(bundle.seen_point, minlength=len(bundle.points)) > 1)[bundle.seen_point]
     sigma = (1.0, corner_sigma_px or 0.1)
+    if like is not None:
+        return _finish(bundle, start, layout, priors, anchor, like.used, (like.track_sigma_px, like.corner_sigma_px))
     for _ in range(3):  # noise, then outliers, then the fit, until they agree
         bundle = _descend(bundle, start, layout, priors, anchor, used, sigma)
         sigma = _noise(bundle, used, corner_sigma_px, layout)
-        distance = np.hypot(*_terms(bundle).residuals[: len(bundle.px)].T)
+        distance = np.hypot(*_residuals(bundle)[: len(bundle.px)].T)
         used = np.where(np.isfinite(distance), distance, np.inf) <= GATE * sigma[0]
         # one sighting does not place a point: its block would be singular, and its rounding would spoil the others'
         used &= (np.bincount(bundle.seen_point[used], minlength=len(bundle.points)) > 1)[bundle.seen_point]
@@ -147,7 +151,7 @@ def settled(bundle: Bundle, corner_sigma_px: float) -> tuple[Bundle, float]:
     layout, priors = _layout(bundle, [np.zeros((9, 0))] * len(bundle.cameras), False), [np.full(9, np.inf)]
     priors *= len(bundle.cameras)
     found = _descend(bundle, bundle, layout, priors, None, none, sigma)
-    return found, _cost(_terms(found), none, sigma)
+    return found, _cost(_residuals(found), none, sigma)
 
 
 def _layout(bundle: Bundle, free: list[np.ndarray], hold_first: bool) -> _Layout:
@@ -196,6 +200,22 @@ def _terms(bundle: Bundle) -> _Terms:
     return _Terms(residuals, by_pose, by_lens, by_world[:count], by_world[count:] @ by_motion, view, marker)
 
 
+def _residuals(bundle: Bundle) -> np.ndarray:
+    """(K + C, 2) measured - predicted, as in `_terms`, without the derivatives."""
+    residuals = np.empty((len(bundle.px) + sum(len(c.px) for c in bundle.corners), 2))
+    for number, pose in enumerate(bundle.poses):
+        camera, mine = bundle.cameras[bundle.camera_of[number]], bundle.seen_view == number
+        points = (bundle.points[bundle.seen_point[mine]] - pose[:3, 3]) @ pose[:3, :3]
+        residuals[: len(bundle.px)][mine] = bundle.px[mine] - project(camera, points)
+    at = len(bundle.px)
+    for c in bundle.corners:
+        pose, camera = bundle.poses[c.view], bundle.cameras[bundle.camera_of[c.view]]
+        points = (transform_points(bundle.markers[c.marker], c.points) - pose[:3, 3]) @ pose[:3, :3]
+        residuals[at : at + len(c.px)] = c.px - project(camera, points)
+        at += len(c.px)
+    return residuals
+
+
 def _weights(terms: _Terms, used: np.ndarray, sigma: tuple[float, float]) -> np.ndarray:
     """(K + C,) weight of each sighting: Huber's over its variance, 0 for those left out."""
     count = len(used)
@@ -207,10 +227,10 @@ def _weights(terms: _Terms, used: np.ndarray, sigma: tuple[float, float]) -> np.
     return weight
 
 
-def _cost(terms: _Terms, used: np.ndarray, sigma: tuple[float, float]) -> float:
+def _cost(residuals: np.ndarray, used: np.ndarray, sigma: tuple[float, float]) -> float:
     """Huber's cost, doubled: chi-square where nothing is far off; infinite when a used sighting leaves its lens."""
     count = len(used)
-    size = np.hypot(*terms.residuals.T)
+    size = np.hypot(*residuals.T)
     size[:count] = np.where(used, size[:count], 0)
     scaled = size / np.where(np.arange(len(size)) < count, sigma[0], sigma[1])
     far = (scaled > HUBER) & (np.arange(len(size)) < count)
@@ -349,7 +369,7 @@ def _descend(
 ) -> Bundle:  # fmt: skip
     """Levenberg-Marquardt at a given noise; a start that already is the minimum comes back."""
     damping = 1e-6
-    cost = _cost(_terms(bundle), used, sigma) + _penalty(bundle, start, priors)
+    cost = _cost(_residuals(bundle), used, sigma) + _penalty(bundle, start, priors)
     system = _system(bundle, start, layout, priors, anchor, used, sigma)
     for _ in range(STEPS):
         reduced, right, inverse = _reduce(system, damping)
@@ -361,7 +381,7 @@ def _descend(
         _, _, _, points_gradient, W = system
         points = np.einsum("mij,mj->mi", inverse, points_gradient - np.stack([part.T @ step for part in W], -1))
         trial = _moved(bundle, layout, step, points)
-        new = _cost(_terms(trial), used, sigma) + _penalty(trial, start, priors)
+        new = _cost(_residuals(trial), used, sigma) + _penalty(trial, start, priors)
         if new <= cost:
             done = cost - new <= 1e-8 * cost
             bundle, cost, damping = trial, new, max(damping * 0.1, 1e-12)
@@ -380,7 +400,7 @@ def _noise(bundle: Bundle, used: np.ndarray, corner_sigma_px: float | None, layo
 
     A point seen n times leaves 2 n - 3 of its 2 n coordinates; the poses take few of the tracks' many.
     """
-    residuals = _terms(bundle).residuals
+    residuals = _residuals(bundle)
     count = len(used)
     track = residuals[:count][used]
     seen = np.bincount(bundle.seen_point[used], minlength=len(bundle.points))
@@ -419,7 +439,7 @@ def _finish(
         part = covariance[at : at + columns.shape[1], at : at + columns.shape[1]]
         lenses.append(columns @ part @ columns.T)
     by_lens = _by_lens(bundle, anchor is not None, used, sigma)
-    deviance = _cost(_terms(bundle), used, sigma)
+    deviance = _cost(_residuals(bundle), used, sigma)
     return Adjusted(bundle, *sigma, used, poses, by_lens, lenses, markers, deviance)
 
 

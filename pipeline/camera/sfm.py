@@ -7,12 +7,12 @@ edges of all markers alike is scale: it is not in the corners' scatter, and is a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pipeline.camera.adjustment import free_columns
+from pipeline.camera.adjustment import free_columns, lens_vector, with_lens
 from pipeline.camera.bundle import Adjusted, Bundle, Corners, adjust
 from pipeline.camera.lens import pixel_rays
 from pipeline.camera.rigid import umeyama
@@ -24,7 +24,8 @@ FILM_MM = 36.0  # width that "35 mm equivalent" focal lengths mean; makers also 
 USUAL_FOCAL = 1.2  # of the long side, without any hint
 FOCAL_SIGMA, CENTRE_SIGMA = 0.25, 0.02  # of the start; the principal point in units of the long side
 NEEDED_DEVIANCE = 9.0  # per parameter that buys a term of the lens: three standard errors
-CALIBRATING_POINTS, ORIENTING_POINTS = 1500, 4000  # with the longest tracks: more cost time and add little
+CALIBRATING_POINTS, ORIENTING_POINTS = 5000, 5000  # more cost time and add little
+CELLS = 8  # of the frame along each side, for keeping points that reach everywhere
 EDGE_BIAS_PX = 0.05  # of a marker's side, in every view alike: blur, clipped paper, tone curve
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("p1", "p2"))
 
@@ -49,10 +50,19 @@ def camera_start(frame: Frame) -> Camera:
 
 
 def bundle_of(reconstruction: Reconstruction, cameras: list[Camera], most: int) -> Bundle:
-    """The cloud and its sightings, for adjusting, with these lenses; at most so many points, by length of track."""
-    lengths = np.bincount(reconstruction.seen_point, minlength=len(reconstruction.points))
-    kept = np.sort(np.argsort(-lengths, kind="stable")[:most])
-    number = np.full(len(lengths), -1)
+    """The cloud and its sightings, for adjusting, with these lenses; at most so many points.
+
+    Long tracks are kept before short ones, and those that reach into parts of the frame that few do: distortion shows
+    at the corners.
+    """
+    counted = len(reconstruction.points)
+    size = np.array([(camera.width, camera.height) for camera in cameras])[reconstruction.camera_of]
+    place = np.clip(reconstruction.px / size[reconstruction.seen_view] * CELLS, 0, CELLS - 1).astype(int)
+    cell = place[:, 1] * CELLS + place[:, 0]
+    rare = 1 / np.maximum(np.bincount(cell, minlength=CELLS**2), 1)[cell]
+    worth = np.bincount(reconstruction.seen_point, weights=rare, minlength=counted)
+    kept = np.sort(np.argsort(-worth, kind="stable")[:most])
+    number = np.full(counted, -1)
     number[kept] = np.arange(len(kept))
     mine = number[reconstruction.seen_point] >= 0
     return Bundle(
@@ -84,18 +94,24 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
     prior = np.array([FOCAL_SIGMA * long] * 2 + [CENTRE_SIGMA * long] * 2 + [np.inf] * 5)
     priors = [prior if n == body else np.full(9, np.inf) for n in range(len(reconstruction.cameras))]
 
-    def fit(terms: tuple[str, ...], cameras: list[Camera]) -> Adjusted:
-        free = [free_columns(terms, True) if n == body else np.zeros((9, 0)) for n in range(len(cameras))]
-        return adjust(bundle_of(reconstruction, cameras, CALIBRATING_POINTS), free, priors, hold_first=True)
+    bundle = bundle_of(reconstruction, reconstruction.cameras, CALIBRATING_POINTS)
 
-    bare = start.model_copy(update={"distortion": np.zeros(5)})
-    cameras = [bare if n == body else camera for n, camera in enumerate(reconstruction.cameras)]
+    def fit(terms: tuple[str, ...], start: Bundle, like: Adjusted | None) -> Adjusted:
+        columns = free_columns(terms, True)
+        lens = lens_vector(start.cameras[body]) * (columns.sum(1) > 0)
+        cameras = [with_lens(c, lens) if n == body else c for n, c in enumerate(start.cameras)]
+        free = [columns if n == body else np.zeros((9, 0)) for n in range(len(cameras))]
+        return adjust(replace(start, cameras=cameras), free, priors, hold_first=True, like=like)
+
+    # noise and outliers are those of the richest model: by a poorer one's, its own misfit would pass for noise
+    every = tuple(term for step in LADDER for term in step)
+    richest = fit(every, bundle, None)
     terms: tuple[str, ...] = ()
-    best = fit(terms, cameras)
+    best = fit(terms, richest.bundle, richest)
     evidence = []
     for step in LADDER:
-        richer = fit(terms + step, best.bundle.cameras)
-        gain = _deviance(best, richer) - _deviance(richer, richer)
+        richer = fit(terms + step, richest.bundle, richest)
+        gain = best.deviance - richer.deviance
         taken = bool(gain > NEEDED_DEVIANCE * len(step))
         evidence.append({
             "term": f"lens {' '.join(step)}", "modelled": taken,
@@ -104,13 +120,8 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
         })  # fmt: skip
         if taken:
             best, terms = richer, terms + step
-    camera = best.bundle.cameras[body].model_copy(
-        update={
-            "covariance": best.lens_covariance[body],
-            "rms_px": float(best.track_sigma_px * np.sqrt(2)),
-            "source": "colmap",
-        }
-    )
+    found = {"covariance": best.lens_covariance[body], "rms_px": float(best.track_sigma_px * np.sqrt(2))}
+    camera = best.bundle.cameras[body].model_copy(update={**found, "source": "colmap"})
     sigma = np.sqrt(np.diag(camera.covariance))
     numbers = {
         "source": "colmap", "track_sigma_px": float(best.track_sigma_px), "photos": len(reconstruction.names),
@@ -119,11 +130,6 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
         "principal_point_sigma_px": sigma[2:4].tolist(), "terms": list(terms),
     }  # fmt: skip
     return camera, numbers, evidence
-
-
-def _deviance(fitted: Adjusted, scale: Adjusted) -> float:
-    """Robust deviance of a fit in the noise of another, so that two models are compared in one unit."""
-    return fitted.deviance * (fitted.track_sigma_px / scale.track_sigma_px) ** 2
 
 
 def oriented(
