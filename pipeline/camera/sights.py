@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.markers import fit_marker, marker_points, tone
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_cells, marker_corners_px
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_corners_px, marker_pattern
 from pipeline.camera.sfm import Seen
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera
@@ -53,7 +53,7 @@ def sighted_marker(radiance: np.ndarray, marker: dict[str, Any], camera: Camera)
         )
     if not len(quads):
         return Sightings(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, int), markers)
-    px = fit_marker(radiance, quads[0], camera, marker_cells(marker["dictionary"]))
+    px = fit_marker(radiance, quads[0], camera, marker_pattern(marker["dictionary"], marker["id"]))
     return Sightings(marker_points(marker["side_m"]), px, np.arange(4), markers)
 
 
