@@ -22,6 +22,7 @@ from pipeline.run.stage import Stage
 from pipeline.types import Camera, Plane, Result, View
 from stages import knobs
 
+EDGE_ON_DEG, GRAZING_DEG = 1.0, 5.0  # elevation of the camera over the plane, seen from a foot: refused, warned of
 NEAREST_DEPTH = (
     0.1  # of the depth of the nearest thing that stands: the rectangle ends there, before the camera's plane
 )
@@ -52,6 +53,8 @@ def compute(
             f"plane: the margin of the rectangle is cut to {kept:.0%} towards the plate camera, as it reached behind it"
         )
     spots = feet or {"marker": ground.mean(0)}
+    elevation = elevation_deg(view, list(spots.values()))
+    warnings += edge_on(elevation)
     contact = {name: sigma for name, spot in spots.items() if np.isfinite(sigma := contact_sigma(camera, view, spot))}
     covariance = plane_covariance(view)
     plane = Plane(
@@ -62,7 +65,8 @@ def compute(
     numbers = {
         "normal_sigma_deg": float(np.degrees(np.hypot(deviations[0], deviations[1]))),
         "offset_sigma_m": float(deviations[2]),
-        "contact_sigma_px": contact, "camera_height_m": height, "object_size_assumed_m": size,
+        "contact_sigma_px": contact, "camera_height_m": height, "elevation_deg": elevation,
+        "object_size_assumed_m": size,
         "rectangle_m": [float(corners[:, 0].min()), float(corners[:, 2].min()),
                         float(corners[:, 0].max()), float(corners[:, 2].max())],
         "margin_kept": kept,
@@ -107,6 +111,24 @@ def check_feet(feet: dict[str, np.ndarray], camera: Camera, view: View) -> list[
     if problems:
         raise ManifestError(*problems)
     return warnings
+
+
+def elevation_deg(view: View, spots: list[np.ndarray]) -> float:
+    """Lowest elevation [deg] of the plate camera above the plane, seen from points (3,) on it."""
+    eye = view.world_from_camera[:3, 3]
+    away = [float(np.linalg.norm((eye - spot)[[0, 2]])) for spot in spots]
+    return float(np.degrees(min(np.arctan2(eye[1], distance) for distance in away)))
+
+
+def edge_on(elevation: float) -> list[str]:
+    """Refuse a plane seen edge-on, warn of one seen at a graze: an error of its tilt moves feet by its cotangent."""
+    text = (
+        f"plate: the camera is {elevation:.1f} degrees above the plane where the objects stand, needed "
+        f"{GRAZING_DEG:g}; photograph from higher up, or bring the objects nearer"
+    )
+    if elevation < EDGE_ON_DEG:
+        raise CaptureError(text)
+    return [text] if elevation < GRAZING_DEG else []
 
 
 def modelled_rectangle(ground: np.ndarray, margin_m: float, view: View) -> tuple[np.ndarray, float]:

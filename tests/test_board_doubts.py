@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import board_sightings, first_calibration, repeated
 from pipeline.camera.rigid import camera_points
 from pipeline.camera.sights import sighted_marker
+from pipeline.probes.finding import Found, complaints
+from pipeline.probes.outline import Height
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Frame, Raster, Reconstruction
 from stages import calibrate, knobs, pose
@@ -257,3 +261,15 @@ class TestPose:
         warnings = self.posed(radiance, **stated, marker=[{**MARKER, "id": 40, "side_m": 0.06}]).warnings
         said = [text for text in warnings if "marker 40: its side is" in text]
         assert (not said) if not line else ("57.0 mm by the board" in said[0] and line in said[0])
+
+
+@pytest.mark.parametrize("stated", [1.0, 0.97, 1.05])
+def test_a_print_of_another_size_is_told_by_the_ball(stated):
+    """A world ``stated`` times as large as the real one: the ball, of true size by its rim, then misses the plane."""
+    height, radius, normal = 0.5, 0.04, np.array([0.0, -0.8, -0.6])
+    centre = normal * (radius - height) + np.array([0, 0.6, -0.8]) * 0.1  # stands on the real plane
+    fit = SimpleNamespace(centre=centre, radius_px=200.0, blur_px=0.5, visible=1.0, covariance=np.eye(3) * 1e-10)
+    ball = Found(fit, fit, Height(normal, stated * height, 1e-4), centre)  # type: ignore[arg-type]
+    said = [text for text in complaints("ball_a", ball, radius) if "off the plane" in text]
+    assert bool(said) == (stated != 1.0)
+    assert all(f"measures {1 / stated:.1%} +- 0.0% of its stated size" in text for text in said)

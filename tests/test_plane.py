@@ -107,6 +107,18 @@ def test_contact_agrees_with_re_estimated_poses() -> None:
     assert plane.contact_sigma(stated_camera, without, foot) > 2 * largest  # the correlation matters
 
 
+@pytest.mark.parametrize(("tilt", "outcome"), [(80, "fine"), (87, "warned"), (89.5, "refused")])
+def test_a_plane_seen_edge_on(tilt: float, outcome: str) -> None:
+    grazing = looking_at(CENTRE, tilt, 15, 2.0)
+    if outcome == "refused":
+        with pytest.raises(CaptureError, match=r"0\.5 degrees above the plane"):
+            run(grazing, objects=[(CENTRE[0], CENTRE[2])])
+        return
+    result = run(grazing, objects=[(CENTRE[0], CENTRE[2])])
+    assert result.numbers["elevation_deg"] == pytest.approx(90 - tilt)
+    assert any("degrees above the plane" in text for text in result.warnings) == (outcome == "warned")
+
+
 def test_refusals() -> None:
     below = POSE.copy()
     below[1, 3] = -0.4

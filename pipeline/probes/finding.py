@@ -251,9 +251,11 @@ def complaints(name: str, ball: Found, radius: float) -> list[str]:
     gap, sigma = discrepancy(ball, radius)
     if abs(gap) > 4 * sigma:
         believed = "The plane was believed" if ball.on_plane else "The rim was believed"
+        print_size, size_sigma = 1 - gap / ball.height.offset_m, sigma / ball.height.offset_m
         said.append(
             f"{name}: the rim alone puts the ball {gap * 1e3:+.1f} +- {sigma * 1e3:.1f} mm off the plane: does it "
-            f"stand on it, are diameter and pose right? {believed}"
+            f"stand on it, are diameter and pose right? If so, the board or marker measures {print_size:.1%} +- "
+            f"{size_sigma:.1%} of its stated size. {believed}"
         )
     return said
 
