@@ -5,8 +5,11 @@ Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares
 and k3 are offered in turn, twice; a term stays when photographs that it was not fitted to gain more than 9 in deviance
 per parameter (three standard errors of a Gaussian) and do so consistently. Covariance: inverse normal matrix of the
 chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Without
-board photographs the lens comes from the tracks of the further views (stage sfm), with the same covariance. Limits:
-one focus and zoom for all photographs of a camera; a flat board; terms left out have no variance, so the evidence says
+board photographs the lens comes from the tracks of the further views (stage sfm), with the same covariance; from a
+former calibration; or, for want of all these, from the focal length in EXIF and lensfun, with the uncertainty that such
+words have. A set of photographs that leaves rays of the frame uncertain is flagged, and the one to take next is named.
+Limits: one focus and zoom for all photographs of a camera; a flat board; Brown's five terms: whether residuals still
+have a pattern over the frame is tested, a fisheye is refused; terms left out have no variance, so the evidence says
 what they could cost.
 """
 
@@ -14,7 +17,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,26 +25,31 @@ import numpy as np
 
 from pipeline.camera import board_doubts
 from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
+from pipeline.camera.board_pictures import board_picture
+from pipeline.camera.exif_camera import exif_camera
+from pipeline.camera.former_camera import reused
 from pipeline.camera.lens import project, unproject
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration, read_grey
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration
 from pipeline.camera.resection import minimise, refine, residuals_and_jacobian, robust_scale
+from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
-from pipeline.run.artifacts import BOARD_PHOTOS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
+from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Reconstruction, Result
+from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result
 from stages import knobs
 
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",))
 FEWEST_CORNERS = 8  # of a photograph that is used
 FEWEST_PHOTOS = 3
-FEW_TWICE = 2  # ids seen twice: one may be texture that reads as a marker
 SAME_FOCAL = 0.01
 NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
 NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
 GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
 CORNER_SIGMA_PX = 0.1
-TILT_DEG = 10.0  # boards all nearer than this to parallel to the sensor do not separate focal length from distance
+REFUSED_FOCAL = 0.05  # standard uncertainty, relative
+SURE, PATTERN_PX = 1e-3, 0.1  # chance by which, and size from which, residuals are said to have a pattern
 
 
 @dataclass(frozen=True)
@@ -58,17 +66,22 @@ class Photos:
 
 
 def compute(
-    facts: dict[str, Any], board_photos: list[dict[str, str]], reconstruction: Reconstruction, params: knobs.Calibrate
-) -> Result:
+    facts: dict[str, Any], brackets: dict[str, Bracket], board_photos: list[dict[str, str]],
+    reconstruction: Reconstruction, params: knobs.Calibrate,
+) -> Result:  # fmt: skip
     """The plate's camera (pixels with the first centre at (0.5, 0.5)), and those of balls that state their own.
 
     Balls that state one camera in the same words share one estimate; their figures bear the first one's name.
     """
-    stated, photos = facts["camera"], photos_of(board_photos, "plate")
-    if not stated.get("given") and not photos:
-        whole = from_tracks(reconstruction)
+    stated, photos, frame = facts["camera"], photos_of(board_photos, "plate"), frame_of(brackets, "plate")
+    if stated.get("given") or stated.get("former") or photos:
+        whole = calibrated(facts, "camera", stated, frame, photos, params)
+    elif facts.get("views"):
+        whole = from_tracks(reconstruction, frame)
     else:
-        whole = calibrated(facts, "camera", stated, photos, params)
+        lens_name = (facts.get("lens") or {}).get("name") or ""
+        camera, numbers, warnings, evidence = exif_camera(_known(frame), lens_name)
+        whole = Result({"camera": camera}, numbers, warnings, evidence)
     cameras: dict[str, Camera] = {}
     done: list[tuple[dict[str, Any], Camera]] = []
     for number, ball in enumerate(facts.get("ball", [])):
@@ -77,8 +90,8 @@ def compute(
             continue
         same = next((camera for other, camera in done if other == stated), None)
         if same is None:
-            photos = photos_of(board_photos, ball["name"])
-            found = calibrated(facts, f"ball[{number}].camera", stated, photos, params)
+            photos, frame = photos_of(board_photos, ball["name"]), frame_of(brackets, ball["name"])
+            found = calibrated(facts, f"ball[{number}].camera", stated, frame, photos, params)
             same = found.outputs["camera"]
             done.append((stated, same))
             whole.numbers[ball["name"]] = found.numbers
@@ -88,7 +101,24 @@ def compute(
     return Result({**whole.outputs, "view_cameras": cameras}, whole.numbers, whole.warnings, whole.evidence)
 
 
-def from_tracks(reconstruction: Reconstruction) -> Result:
+def frame_of(brackets: dict[str, Bracket], view: str) -> Frame | None:
+    """A photograph of the view, for what its metadata say of the optics."""
+    return next(iter(brackets[view].frames), None) if view in brackets else None
+
+
+def _known(frame: Frame | None) -> Frame:
+    assert frame is not None  # ingest has read every view
+    return frame
+
+
+def of_optics(camera: Camera, frame: Frame | None) -> Camera:
+    """The camera with the names of what it is the camera of, so that it can be told when it is used again."""
+    if frame is None:
+        return camera
+    return camera.model_copy(update={"body": frame.camera, "lens": frame.lens, "focal_mm": frame.focal_mm})
+
+
+def from_tracks(reconstruction: Reconstruction, frame: Frame | None) -> Result:
     """The plate's camera from the tracks of the reconstruction, for want of board photographs."""
     if "plate" not in reconstruction.names:
         raise CaptureError(
@@ -102,7 +132,7 @@ def from_tracks(reconstruction: Reconstruction) -> Result:
             f"calibrate: the focal length is known to {numbers['focal_sigma_rel']:.1%} only; add views from other "
             "heights and with the camera turned by 90 degrees, or photographs of a board"
         )
-    return Result({"camera": camera}, numbers, warnings, evidence)
+    return Result({"camera": of_optics(camera, frame)}, numbers, warnings, evidence)
 
 
 def photos_of(board_photos: list[dict[str, str]], view: str) -> list[dict[str, str]]:
@@ -111,10 +141,16 @@ def photos_of(board_photos: list[dict[str, str]], view: str) -> list[dict[str, s
 
 
 def calibrated(
-    facts: dict[str, Any], where: str, stated: dict[str, Any], board_photos: list[dict[str, str]],
+    facts: dict[str, Any], where: str, stated: dict[str, Any], frame: Frame | None, board_photos: list[dict[str, str]],
     params: knobs.Calibrate,
 ) -> Result:  # fmt: skip
-    """One camera, from its given numbers or from its board photographs."""
+    """One camera, from its given numbers, a former calibration or its board photographs."""
+    if stated.get("former"):
+        former = Camera.model_validate(stated["former"])
+        camera, said, terms = reused(former, _known(frame), where)
+        relative = float(np.sqrt(camera.covariance[0, 0]) / camera.fx)
+        numbers = {"source": "reused", "of": former.source, "rms_px": camera.rms_px, "focal_sigma_rel": relative}
+        return Result({"camera": camera}, numbers, said, terms)
     if stated.get("given"):
         camera = given_camera(stated["given"], where)
         term = {
@@ -129,7 +165,8 @@ def calibrated(
     start, poses = first_calibration(photos.world_m, photos.px, size)
     photos, poses = drop_bad(start, photos, poses, warnings)
     chosen, errors, evidence = climb(start, poses, photos)
-    return judge(chosen, photos, errors, evidence, warnings, params)
+    judged = judge(chosen, photos, errors, evidence, warnings, params)
+    return replace(judged, outputs={"camera": of_optics(judged.outputs["camera"], frame)})
 
 
 def given_camera(given: dict[str, Any], where: str = "camera") -> Camera:
@@ -156,8 +193,8 @@ def sight(
     files = [photo["file"] for photo in board_photos]
 
     def look(file: str) -> tuple[tuple[int, int], Sightings]:
-        grey = read_grey(root / file)
-        return (grey.shape[1], grey.shape[0]), board_sightings(grey, grey, facts["board"])
+        plain, precise = board_picture(root / file)
+        return (plain.shape[1], plain.shape[0]), board_sightings(plain, precise, facts["board"])
 
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # OpenCV releases the GIL
         found = list(pool.map(look, files))
@@ -166,7 +203,7 @@ def sight(
         listed = ", ".join(f"{w}x{h} ({file})" for (w, h), file in sizes.items())
         turned = " as on the sensor (some are turned by 90 degrees)" if len({min(s) for s in sizes}) == 1 else ""
         raise CaptureError(f"calibration photographs: sizes {listed}, needed one size{turned}; take out the others")
-    double = [i for i, (_, seen) in enumerate(found) if len(seen.twice) >= FEW_TWICE]
+    double = [i for i, (_, seen) in enumerate(found) if len(seen.twice) >= board_doubts.TWICE]
     usable = [i for i, (_, seen) in enumerate(found) if len(seen.px) >= FEWEST_CORNERS and i not in double]
     for i in double:
         warnings.append(f"{files[i]}: {len(found[i][1].twice)} ids are seen twice, needed one board; left out")
@@ -176,7 +213,7 @@ def sight(
             f"{files[i]}: {len(seen.px)} corners ({seen.markers} markers) found, needed {FEWEST_CORNERS}; left out"
         )
     if len(usable) < FEWEST_PHOTOS:
-        others = [read_grey(root / files[i]) for i in range(len(files)) if i not in usable and i not in double]
+        others = [board_picture(root / files[i])[0] for i in range(len(files)) if i not in usable and i not in double]
         instead = board_doubts.of_board(others, facts["board"]) if others else ""
         cover = "; cover all boards but one" if double else ""
         raise CaptureError(
@@ -343,49 +380,66 @@ def judge(
     warnings: list[str],
     params: knobs.Calibrate,
 ) -> Result:
-    """Refuse what does not determine a lens, warn about what hardly does, and report."""
+    """Refuse what does not determine a lens, warn about what hardly does and say what to photograph, and report."""
     camera = chosen.camera
+    shape = pattern(photos.px, chosen.residuals_px, camera.width, camera.height)
     if chosen.rms_px > params.max_rms_px:
+        fisheye = "" if shape.chance > SURE else "; residuals have a pattern over the frame: is it a fisheye?"
         raise NumericalError(
             f"calibrate: residual {chosen.rms_px:.2f} px, needed {params.max_rms_px} px; is the board flat, are "
-            "square_m and squares right, and focus and zoom the same in all photographs?"
+            f"square_m and squares right, and focus and zoom the same in all photographs?{fisheye}"
         )
+    views = ViewSet(camera, chosen.poses, photos.world_m, photos.px, chosen.sigma_px)
+    try:
+        certain = lens_sigma(camera, summed(views), chosen.sigma_px)
+    except NumericalError as error:
+        raise NumericalError(
+            "calibrate: the distortion ends within the frame, needed a lens that fills it: a fisheye is not modelled; "
+            "if it is none, photograph the board in the corners of the frame"
+        ) from error
     sigma = np.sqrt(np.diag(camera.covariance))
     relative = float(sigma[0] / camera.fx)
     # The board's normal is world +Y; its angle to the optical axis is the tilt.
     tilts = np.degrees([np.arccos(min(1.0, abs(pose[1, 2]))) for pose in chosen.poses])
-    if tilts.max() < TILT_DEG or relative > 0.01:
-        text = (
-            f"calibrate: board tilts reach {tilts.max():.0f} deg and the focal length is known to {relative:.2%}, "
-            "needed tilts of 30 deg and 1 %; add photographs with the board tilted 30 to 45 degrees several ways"
-        )
-        if relative > 0.05:
-            raise NumericalError(text)
-        warnings.append(text)
     everything = np.concatenate(photos.px)
     span = (np.ptp(everything, axis=0) / (camera.width, camera.height)).tolist()
-    if min(span) < 0.6:
-        warnings.append(
-            f"calibrate: corners span {span[0]:.0%} by {span[1]:.0%} of the frame, needed 60 %; distortion outside is "
-            "extrapolated; add photographs with the board near the edges"
-        )
+    doubts = doubts_of(camera, len(photos.files), float(tilts.max()), relative, everything, span, certain[1])
     numbers = {
         "source": camera.source, "rms_px": chosen.rms_px, "corner_sigma_px": chosen.sigma_px,
         "photos": len(photos.files), "corners": len(everything), "held_out_rms_px": errors,
         "focal_sigma_rel": relative, "principal_point_sigma_px": sigma[2:4].tolist(),
         "tilt_max_deg": float(tilts.max()), "frame_span": span,
+        "lens_sigma_px": {"rms": certain[0], "worst": certain[1]},
         "photo_rms_px": {
             file: float(np.sqrt((r**2).sum(-1).mean()))
             for file, r in zip(photos.files, chosen.residuals_px, strict=True)
         },
     }  # fmt: skip
-    return Result({"camera": camera}, numbers, warnings, evidence)
+    if doubts:
+        best, left = next_photograph(views)
+        advice = f"photograph next: {best}; it brings the lens from {certain[0]:.2g} to {left:.2g} px over the frame"
+        if relative > REFUSED_FOCAL:
+            raise NumericalError(f"calibrate: {doubts[0]}; {advice}")
+        warnings += [f"calibrate: {text}" for text in (*doubts, advice)]
+        numbers["next_photograph"] = best
+    if shape.chance < SURE and shape.rms_px > PATTERN_PX:
+        warnings.append(
+            f"calibrate: residuals have a pattern over the frame, {shape.rms_px:.2f} px rms, {shape.largest_px:.2f} px "
+            "at most; the lens bends as Brown's terms cannot, or the board is not flat"
+        )
+    beyond = {
+        "term": "lens beyond Brown's terms (rational, fisheye)", "modelled": False,
+        "because": f"residuals averaged over {shape.cells} cells of the frame: so large without a pattern in "
+        f"{shape.chance:.2g} of sets",
+        "could_cost": f"{shape.rms_px:.3f} px rms over the frame, {shape.largest_px:.3f} px at most",
+    }  # fmt: skip
+    return Result({"camera": camera}, numbers, warnings, [*evidence, beyond])
 
 
 STAGE = Stage(
     "calibrate",
     compute,
     knobs.Calibrate,
-    inputs={"facts": FACTS, "board_photos": BOARD_PHOTOS, "reconstruction": RECONSTRUCTION},
+    inputs={"facts": FACTS, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS, "reconstruction": RECONSTRUCTION},
     outputs={"camera": CAMERA, "view_cameras": VIEW_CAMERAS},
 )

@@ -121,7 +121,8 @@ def stated(where: Path) -> Checked:
         plate, [against_plate(s, plate) if plate is not None else s for s in listed if s.role == "ball"],
         [s for s in listed if s.role == "calibration"], layout,
         frozenset(b.name for b in facts.ball if b.camera is not None), bool(facts.reference),
-        facts.camera.given is not None, frozenset(p.view for p in facts.pose), tuple(flaws),
+        facts.camera.given is not None or facts.camera.file is not None,
+        frozenset(p.view for p in facts.pose), tuple(flaws),
     )  # fmt: skip
 
 

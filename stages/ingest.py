@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from pipeline.camera.former_camera import add_former_cameras
 from pipeline.camera.stated import read_pose
 from pipeline.camera.view_checks import lens_strangers, zoom_differs
 from pipeline.image.colour import convert
@@ -74,6 +75,7 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}
     brackets = _brackets(facts, root, manifest, problems, flaws, warnings)
     _check_zoom(brackets, board_frames, flaws, warnings)
+    problems.extend(add_former_cameras(dumped, manifest, [manifest.parent, root]))
     dumped["probe"] |= _probe_files(facts, root, manifest, problems, flaws)
     view_photos = _view_photos(facts, root, manifest, problems, flaws)
     dumped["pose"] = _poses(facts, root, manifest, problems)

@@ -88,7 +88,7 @@ def bodies_of(
     """
     own = {ball["name"] for ball in facts["ball"] if ball.get("camera")}
     plate = brackets["plate"].frames[0]
-    given = facts["camera"].get("given")
+    given = facts["camera"].get("given") or facts["camera"].get("former")
     cameras = [_given(given) if given else camera_start(_hinted(plate, view_photos))]
     bodies = {name: 0 for name, b in brackets.items() if name not in own and b.role in ("plate", "ball")}
     other = bool(facts["views"]["own_camera"])

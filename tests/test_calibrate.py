@@ -49,14 +49,16 @@ def corners_of(poses: list[np.ndarray], camera: Camera, sigma: float, seed: int)
 def run(monkeypatch: pytest.MonkeyPatch, corners: list[np.ndarray], sizes: list[tuple[int, int]] | None = None):
     """The stage on given corners instead of pictures."""
     sizes = sizes or [(768, 1024)] * len(corners)
-    monkeypatch.setattr(calibrate, "read_grey", lambda path: np.full(sizes[int(path.stem)], int(path.stem), np.uint8))
+    monkeypatch.setattr(
+        calibrate, "board_picture", lambda path: (np.full(sizes[int(path.stem)], int(path.stem), np.uint8),) * 2
+    )
     monkeypatch.setattr(
         calibrate, "board_sightings",
         lambda grey, _, board: Sightings(POINTS[: len(corners[grey[0, 0]])], corners[grey[0, 0]], np.arange(24), 17),
     )  # fmt: skip
     facts = {"capture_root": ".", "board": BOARD, "camera": {"calibration": ["*.jpg"], "given": None}}
     return calibrate.compute(
-        facts, [{"file": f"{i}.jpg"} for i in range(len(corners))], Reconstruction(), knobs.Calibrate()
+        facts, {}, [{"file": f"{i}.jpg"} for i in range(len(corners))], Reconstruction(), knobs.Calibrate()
     )
 
 
@@ -153,7 +155,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_given_camera() -> None:
     given = {"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "distortion": [0.1]}
-    result = calibrate.compute({"camera": {"given": given}}, [], Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute({"camera": {"given": given}}, {}, [], Reconstruction(), knobs.Calibrate())
     camera = result.outputs["camera"]
     assert camera.source == "given"
     np.testing.assert_array_equal(camera.distortion, [0.1, 0, 0, 0, 0])
@@ -161,16 +163,16 @@ def test_given_camera() -> None:
     bad = {**given, "focal": 1.0}
     del bad["fx"]
     with pytest.raises(ManifestError) as error:
-        calibrate.compute({"camera": {"given": bad}}, [], Reconstruction(), knobs.Calibrate())
+        calibrate.compute({"camera": {"given": bad}}, {}, [], Reconstruction(), knobs.Calibrate())
     assert len(error.value.problems) == 2
 
 
-def photographs_of(folder: Path) -> tuple[dict, list[dict[str, str]]]:
+def photographs_of(folder: Path) -> tuple[dict, dict, list[dict[str, str]]]:
     files = sorted(folder.glob("calibration/*.jpg"))
     if not files:
         pytest.skip(f"no capture in {folder}")
     facts = {"capture_root": str(folder), "board": BOARD, "camera": {"calibration": ["x"], "given": None}}
-    return facts, [{"file": str(file.relative_to(folder))} for file in files]
+    return facts, {}, [{"file": str(file.relative_to(folder))} for file in files]
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,10 @@ PLACES = {
     "in the middle": (0, 0), "in the upper left": (-1, -1), "in the upper right": (1, -1), "in the lower left": (-1, 1),
     "in the lower right": (1, 1),
 }  # fmt: skip
+WARNED_FOCAL = 0.01  # standard uncertainty, relative
+LEAST_SPAN = 0.6  # of the frame, by corners of boards, each way
+LEAST_TILT_DEG = 10.0  # boards all nearer to parallel to the sensor do not separate focal length from distance
+ENOUGH_PHOTOS = 6
 PRIOR_PX, PRIOR_BEND = 1e4, 1.0  # of focal length and centre, and of k1, k2: keeps what nothing determines finite
 
 
@@ -116,3 +120,28 @@ def empty_corners(px: np.ndarray, width: int, height: int) -> list[str]:
     seen = set(zip(row.tolist(), column.tolist(), strict=True))
     names = {(0, 0): "upper left", (0, 2): "upper right", (2, 0): "lower left", (2, 2): "lower right"}
     return [name for cell, name in names.items() if cell not in seen]
+
+
+def doubts_of(
+    camera: Camera, photos: int, tilt_deg: float, focal_sigma: float, px: np.ndarray, span: list[float], worst_px: float
+) -> list[str]:
+    """What the photographs hardly determine, one line each, the gravest first."""
+    doubts = []
+    if tilt_deg < LEAST_TILT_DEG or focal_sigma > WARNED_FOCAL:
+        doubts.append(
+            f"board tilts reach {tilt_deg:.0f} deg and the focal length is known to {focal_sigma:.2%}, "
+            "needed tilts of 30 deg and 1 %; add photographs with the board tilted 30 to 45 degrees several ways"
+        )
+    if empty := empty_corners(px, camera.width, camera.height):
+        doubts.append(
+            f"the {', '.join(empty)} of the frame never showed the board, needed all corners; distortion "
+            f"there is extrapolated and rays are known to {worst_px:.2g} px at worst"
+        )
+    elif min(span) < LEAST_SPAN:
+        doubts.append(
+            f"corners span {span[0]:.0%} by {span[1]:.0%} of the frame, needed {LEAST_SPAN:.0%}; distortion "
+            f"outside is extrapolated and rays are known to {worst_px:.2g} px at worst"
+        )
+    if photos < ENOUGH_PHOTOS:
+        doubts.append(f"{photos} photographs, needed {ENOUGH_PHOTOS} for an error on held-out ones to choose the model")
+    return doubts

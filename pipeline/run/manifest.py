@@ -31,7 +31,7 @@ class PlateFacts(Strict):
 
 
 class CameraFacts(Strict):
-    """Where the intrinsics come from: board photographs, given numbers (pixel origin of conventions), or a camera.json."""
+    """Where the intrinsics come from: board photographs, given numbers (pixel origin of conventions), a camera.json."""
 
     calibration: list[str] = Field([], description="board photographs, files or globs")
     given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
