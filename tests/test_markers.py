@@ -45,7 +45,7 @@ def board_errors(
     picture = picture + noise * np.random.default_rng(0).normal(size=picture.shape).astype(np.float32)
     toned = tone(picture, tones)
     seen = opencv_bridge.board_sightings(eight_bit(toned), toned, BOARD, camera)
-    assert len(seen.px) >= 20  # at 60 deg the farthest markers are too small to read
+    assert len(seen.px) >= (15 if blur else 20)  # small blurred markers, and the farthest at 60 deg, are not read
     return seen.px - project(camera, camera_points(pose, seen.world_m)[0])
 
 
