@@ -14,6 +14,7 @@ from pipeline.conventions import CLIPPED, invert_rigid, latlong_directions, latl
 from pipeline.light import ball_shadow
 from pipeline.light.flux import Card, Shadow, predicted, solve
 from pipeline.probes import clipped
+from pipeline.probes.cards import Cards
 from pipeline.probes.clipped_lights import find_lights
 from pipeline.probes.shadow_blocks import MODEL, plane_blocks
 from pipeline.types import BallFit, Raster
@@ -54,7 +55,7 @@ def ball_fit(scene, sigma: float = 5e-5) -> BallFit:
     )  # fmt: skip
 
 
-def case(scene, pictures, strengths, columns: slice = slice(None), unmapped: tuple[int, ...] = (), cards=()):
+def case(scene, pictures, strengths, columns: slice = slice(None), unmapped: tuple[int, ...] = ()):
     """`recover` with lamps of irradiance ``strengths`` (4,), as a multiple of the sky's on the table, and their fluxes.
 
     ``columns``: the part of the pictures that exists; ``unmapped``: lamps that the probe did not see.
@@ -72,7 +73,7 @@ def case(scene, pictures, strengths, columns: slice = slice(None), unmapped: tup
     mapped = [np.zeros(3) if number in unmapped else flux for number, flux in enumerate(fluxes)]
     rgb, over = flux_scene.true_map(scene, mapped, CLIP)
     seen = clipped.Witness(
-        ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance), blocks, list(cards),
+        ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance), blocks,
         shift=np.array([0, 0, 5e-5]), eye=scene.world_from_camera[:3, 3],
     )  # fmt: skip
     return clipped.recover(rgb, (0.01 * rgb) ** 2, over, seen), fluxes, rgb, over
@@ -217,7 +218,9 @@ def test_a_card_of_known_albedo_is_evidence_too(scene, pictures):
     below = latlong_directions(*over.shape)[..., 1:2] < 0
     plane_lit = np.where(below, rgb, sky)
     measured = (plane_lit * weight[..., None]).sum((0, 1)) + flux * (normal @ scene.lamps[0].direction)
-    found = clipped.recover(rgb, (0.01 * rgb) ** 2, over, clipped.Witness(cards=[(measured, 0.005 * measured, normal)]))
+    found = clipped.recover(
+        rgb, (0.01 * rgb) ** 2, over, clipped.Witness(cards=Cards(measured[None], 0.005 * measured[None], normal[None]))
+    )
     check(found.numbers["clipped_lights"][0], flux)
 
 

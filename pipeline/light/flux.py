@@ -13,7 +13,7 @@ neighbouring points (Liang and Zeger, Biometrika 73, 1986), or the photographs' 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,16 +54,9 @@ class Card:
     def measured(
         irradiance: np.ndarray, sigma: np.ndarray, normal: np.ndarray, sky: np.ndarray, directions: np.ndarray
     ) -> Card:
-        """One card: measured irradiance (3,) with sigma (3,), its unit normal (3,), the sky's irradiance (3,) on it."""
-        facing = np.maximum(np.reshape(directions, (-1, 3)) @ normal, 0)
-        return Card(irradiance[None], sigma[None], sky[None], facing[None])
-
-    @staticmethod
-    def joined(cards: list[Card]) -> Card | None:
-        """Several as one; None of none."""
-        if not cards:
-            return None
-        return Card(*(np.concatenate([getattr(card, part.name) for card in cards]) for part in fields(Card)))
+        """From measured irradiance (M, 3) with sigma (M, 3), unit normals (M, 3), the sky's irradiance (M, 3) there."""
+        facing = np.maximum(np.atleast_2d(normal) @ np.reshape(directions, (-1, 3)).T, 0)
+        return Card(np.atleast_2d(irradiance), np.atleast_2d(sigma), np.atleast_2d(sky), facing)
 
 
 @dataclass(frozen=True)

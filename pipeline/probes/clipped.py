@@ -20,6 +20,7 @@ from pipeline.light import ball_shadow
 from pipeline.light.emitters import Sky, lights
 from pipeline.light.environment import irradiance, resize_environment
 from pipeline.light.flux import Card, Fluxes, Shadow, predicted, solve
+from pipeline.probes.cards import Cards, cards_of
 from pipeline.probes.clipped_lights import PART, Light, find_lights, held_by, light_of, without
 from pipeline.probes.observation import Observation, Shots, ViewMap
 from pipeline.probes.shadow_blocks import MODEL, Blocks, plane_blocks
@@ -43,6 +44,7 @@ WEAK = 0.5  # relative sigma of a flux from which on the bound says as much
 DIRECTION_SIGMA = np.radians(0.25)  # of a clipped lamp's centroid
 REFLECTANCE_SIGMA = 0.02  # of the ball, for what it mirrors to the plane
 LEVEL = np.diag([1.0, 0.0, 1.0])  # the ball stands on the plane
+SHADED = 3.0  # sigma below what lamps must at least give it: a card that something shades
 DARKER, PATCH = 0.05, 25  # a patch of so many blocks this much darker than predicted: a lamp that the map lacks
 
 
@@ -56,14 +58,14 @@ NOTHING = {
 class Witness:
     """What may answer to the fluxes: blocks of the plane around a ball, or surfaces of known albedo; either or both.
 
-    ``cards``: measured irradiance (3,), sigma (3,) and unit normal (3,) of each. ``shift`` (3,): one standard deviation
+    ``cards``: surfaces of known reflectance. ``shift`` (3,): one standard deviation
     of the ball's centre [m] on the plane, along the axis where it is largest, world frame; ``eye`` (3,): the camera.
     ``scale_sigma`` (3,): relative, of the whole map.
     """
 
     ball: ball_shadow.Ball | None = None
     blocks: Blocks | None = None
-    cards: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+    cards: Cards = field(default_factory=Cards)
     scale_sigma: np.ndarray | float = 0.0
     shift: np.ndarray | None = None
     eye: np.ndarray | None = None
@@ -168,16 +170,20 @@ def _vague(found: list[Light], refused: dict[int, str], rest: Setting) -> str:
 
 def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Answer], dict[str, Any]]:
     """One answer for each lamp, and figures of the solution."""
+    said: dict[str, Any] = {"flux_references": seen.cards.said} if seen.cards.said else {}
     none = [Answer(light.bound, np.full(3, np.inf), np.inf, 0, seen.missing) for light in asked]
-    fluxes, shadow = solved(seen, rest, asked) if asked else (None, None)
+    card, shaded = _lit(seen.cards, rest, asked) if asked else (None, 0)
+    said |= {"flux_rows_shaded": shaded} if said else {}
+    fluxes, shadow = solved(seen, rest, asked, card) if asked else (None, None)
     if fluxes is None:
-        return none, {}
+        shade = [replace(answer, refused="the references lie in the shade") for answer in none]
+        return shade if shaded else none, said
     sigma = np.sqrt(np.stack([np.diag(one) for one in fluxes.covariance], -1) + systematic(seen, rest, asked, fluxes))
     unseen = unseen_lamp(shadow, fluxes) if shadow else ""
     answers = []
-    for k, light in enumerate(asked):
+    for k in range(len(asked)):
         dark = int((shadow.reach.visible[:, k] < 0.5).sum()) if shadow else 0
-        faced = any(normal @ light.direction > LOWEST for _, _, normal in seen.cards)
+        faced = card is not None and bool((card.cosine[:, k] > LOWEST).any())
         worst = max(
             (fluxes.condition[c] for c in range(3) if abs(fluxes.weakest[c, k]) > INVOLVED), default=0.0
         )  # fmt: skip
@@ -192,7 +198,7 @@ def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Ans
             why = "its shadow is too faint to tell"
         edge = edge_of(seen, rest, asked, k, fluxes.value) if not why and dark >= LEAST else None
         answers.append(Answer(fluxes.value[k], sigma[k], float(fluxes.condition.max()), dark, why, edge))
-    numbers: dict[str, Any] = {"flux_condition": fluxes.condition.tolist()}
+    numbers = {"flux_condition": fluxes.condition.tolist(), **said}
     if shadow:
         numbers |= {
             "ball_over_plate": fluxes.exposure.tolist(), "shadow_chi2": fluxes.chi2.tolist(),
@@ -270,8 +276,8 @@ def _named(row: dict[str, Any]) -> str:
 def _warning(number: int, row: dict[str, Any]) -> str:
     return (
         f"clipped lamp {number} ({_named(row)}) stays a lower bound of {row['share']:.1%} of the light: "
-        f"{row['why_not']}; add a shorter exposure or an ND filter, or photograph the ball with its whole shadow "
-        "from the tripod"
+        f"{row['why_not']}; add a shorter exposure or an ND filter, lay a card of known reflectance into its light "
+        "([[reference]]), or photograph the ball with its whole shadow from the tripod"
     )
 
 
@@ -299,7 +305,7 @@ def clipped_share(share: np.ndarray, maps: list[ViewMap]) -> np.ndarray:
 
 def witness(shots: Shots, observed: Observation) -> Witness:
     """What the photographs offer: the plane beside the first ball that the tripod saw, as the plate did."""
-    scale = np.broadcast_to(observed.scale_sigma, 3)
+    scale, cards = np.broadcast_to(observed.scale_sigma, 3), cards_of(shots)
     for ball in shots.facts.get("ball", []):
         name = ball["name"]
         if not ball.get("tripod", False) or name not in observed.balls or shots.views[name].camera is not None:
@@ -311,10 +317,11 @@ def witness(shots: Shots, observed: Observation) -> Witness:
         centre = transform_points(pose, fit.centre_camera_m)
         values, axes = np.linalg.eigh(LEVEL @ pose[:3, :3] @ fit.covariance @ pose[:3, :3].T @ LEVEL)
         return Witness(
-            ball_shadow.Ball(centre, fit.radius_m, fit.reflectance), blocks, shift=axes[:, -1] * np.sqrt(values[-1]),
-            eye=pose[:3, 3], scale_sigma=scale, missing="the plane beside the ball cannot be compared with the plate",
+            ball_shadow.Ball(centre, fit.radius_m, fit.reflectance), blocks, cards,
+            shift=axes[:, -1] * np.sqrt(values[-1]), eye=pose[:3, 3],
+            scale_sigma=scale, missing="the plane beside the ball cannot be compared with the plate",
         )  # fmt: skip
-    return Witness(scale_sigma=scale)
+    return Witness(cards=cards, scale_sigma=scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,18 +359,12 @@ def _free_sigma(variance: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(((weight[..., None] * sigma) ** 2).sum((0, 1))))
 
 
-def solved(seen: Witness, rest: Setting, found: list[Light]) -> tuple[Fluxes | None, Shadow | None]:
+def solved(seen: Witness, rest: Setting, found: list[Light], card: Card | None) -> tuple[Fluxes | None, Shadow | None]:
     """Fluxes of the lamps from all evidence, and the shadow they rest on; None without any.
 
     The light between ball and plane needs the plane's albedo and so the fluxes: solved by turns.
     """
     bound = np.array([light.bound for light in found])
-    directions = np.array([light.direction for light in found])
-    cards = [
-        Card.measured(e, sigma, normal, irradiance(rest.whole, normal[None])[0], directions)
-        for e, sigma, normal in seen.cards
-    ]
-    card = Card.joined(cards)
     chosen = _chosen(seen, found, rest.known)
     if chosen is None:
         return (solve(None, card, bound) if card else None), None
@@ -388,6 +389,24 @@ def solved(seen: Witness, rest: Setting, found: list[Light]) -> tuple[Fluxes | N
         if np.all(np.abs(total - before) < SETTLED * total):
             break
     return fluxes, shadow
+
+
+def _lit(cards: Cards, rest: Setting, found: list[Light]) -> tuple[Card | None, int]:
+    """The cards as equations, None without any; and how many have less light than the lamps must at least give them:
+
+    something shades these, and they are left out.
+    """
+    if not len(cards.normal):
+        return None, 0
+    rows = min(SKY_ROWS, len(rest.whole))
+    sky = irradiance(resize_environment(rest.whole, rows, 2 * rows), cards.normal)
+    card = Card.measured(
+        cards.irradiance, cards.sigma, cards.normal, sky, np.array([light.direction for light in found])
+    )
+    least = sky + card.cosine @ np.array([light.bound for light in found])
+    lit = (card.irradiance > least - SHADED * card.sigma).all(-1)
+    kept = Card(card.irradiance[lit], card.sigma[lit], sky[lit], card.cosine[lit]) if lit.any() else None
+    return kept, int((~lit).sum())
 
 
 def _prepared(points: np.ndarray, ball: ball_shadow.Ball, rest: Setting, everyone: list[Light]) -> ball_shadow.Prepared:
