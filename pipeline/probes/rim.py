@@ -37,8 +37,8 @@ STUDENT = 4.0  # degrees of freedom that the noise model has in a sector's weigh
 MODEL_REL = 1e-3  # of the radiance: no model of the light is better than this
 # What the sectors have in common that the sandwich cannot see, in blurs: a common inset, and a drift to one side.
 # Measured over simulated balls by `benchmarks.probe_fit.coverage`. A drift evens out over the outline less when the
-# frame shows only a part of it, so the part is its divisor: judged by hand on 30 balls cut to 40 to 57 %, of which 29 lay
-# in their 95 % region with it and 23 without. Too few to say more than that it helps.
+# frame shows only a part of it, so the part is its divisor: judged by hand on 30 balls cut to 40 to 57 %, of which 29
+# lay in their 95 % region with it and 23 without. Too few to say more than that it helps.
 INSET_BLURS, DRIFT_BLURS = 0.65, 0.58
 
 
