@@ -106,7 +106,8 @@ def design(factors: int) -> list[tuple[bool, ...]]:
 
 
 def _product(signs: tuple[int, ...], columns: tuple[int, ...]) -> int:
-    result = 1
+    """Of the columns, with the sign that leaves nothing changed where none of them is."""
+    result = (-1) ** (len(columns) + 1)
     for column in columns:
         result *= signs[column]
     return result

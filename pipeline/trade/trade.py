@@ -6,6 +6,7 @@ Rows, pages and the list of what failed lie in ``trade/`` of the build folder; n
 
 from __future__ import annotations
 
+import functools
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from pipeline.run.settings import Settings
 from pipeline.run.stage import Graph
 from pipeline.trade import front, page, scores
 from pipeline.trade.points import Changes, Point, combinations, singles
-from pipeline.trade.work import Bench, Row, alone, error_of, source_of
+from pipeline.trade.work import Bench, Row, alone, code_of, error_of, source_of
 
 PRESETS = ("draft", "preview", "final")
 REFERENCE = "final"  # stands in for the truth where there is none
@@ -136,10 +137,13 @@ def prepared(asked: Asked, root: Path, say: Say) -> tuple[str, Session, Point]:
         source, _ = source_of(build, against)
     base = Point(f"{asked.base}", "base", asked.base)
 
+    @functools.cache
     def settle(point: Point) -> Settings:
         return asked.settle(point.quality, point.switches)
 
-    bench = Bench(asked.graph, root, settle, judge_of(root, against, truth), source, build.versions)
+    bench = Bench(
+        asked.graph, root, settle, judge_of(root, against, truth), source, build.versions, code_of(asked.graph)
+    )
     bench.keep = frozenset(bench.keys(base).values())
     if asked.reuse:
         bench.adopt(asked.out, base)

@@ -31,6 +31,7 @@ from pipeline.run.stage import Graph
 from pipeline.trade.points import Point
 
 LAST = "composite"  # what a user waits for; the stages after it only judge and show
+STARTING = 4.0  # seconds, about, to start a process, read what was linked, and score
 Row = dict[str, Any]
 
 
@@ -58,6 +59,7 @@ class Bench:
     judge: Callable[[Path], dict[str, float | None]]
     source: str  # digest of the photographs and wishes, and of what the figures are against
     versions: dict[str, str]
+    code: dict[str, str]  # digest of every stage's code, as it was at the beginning
     keep: frozenset[str] = frozenset()  # chain keys of stages that stay in the store whoever needs them
 
     def keys(self, point: Point) -> dict[str, str]:
@@ -66,11 +68,9 @@ class Bench:
 
     def key(self, point: Point) -> str:
         """Digest of all that decides a point's row."""
-        stages = self.graph.upto(LAST)
-        code = {stage.name: closure.digest(stage.compute.__module__) for stage in stages}
         params = self.settle(point).params
-        chosen = {stage.name: params[stage.name] for stage in stages}
-        return digest_of([self.source, chosen, code, closure.digest("pipeline.trade.scores"), self.versions])
+        chosen = {stage.name: params[stage.name] for stage in self.graph.upto(LAST)}
+        return digest_of([self.source, chosen, self.code, self.versions])
 
     def known(self, point: Point) -> Row | None:
         """The row of a point that was measured before."""
@@ -112,6 +112,10 @@ class Bench:
         records = {name: json.loads((work / name / "record.json").read_bytes()) for name in keys}
         if part := [name for name, record in records.items() if not is_complete(record)]:
             raise ArtifactError(f"{work}: {', '.join(part)} was interrupted; run insitu trade again")
+        if other := [name for name, record in records.items() if record.get("code") != self.code[name]]:
+            raise ArtifactError(
+                f"{', '.join(other)}: the code changed while it was measured; run insitu trade again, all points anew"
+            )
         kept = ("seconds", "cpu_seconds", "peak_mb")
         stages = {name: {key: record.get(key, 0.0) for key in kept} for name, record in records.items()}
         return {
@@ -195,11 +199,17 @@ class Bench:
 
     def expected(self, point: Point, seconds: dict[str, float]) -> float:
         """Seconds that a point will take if its stages take what the base's did; linked ones nothing."""
-        return sum(
+        return STARTING + sum(
             seconds.get(name, 0.0)
             for name, key in self.keys(point).items()
             if not (self.stored(name, key) / "record.json").exists()
         )
+
+
+def code_of(graph: Graph) -> dict[str, str]:
+    """Digest of the code of every stage up to `LAST`, and of the scores."""
+    modules = {stage.name: stage.compute.__module__ for stage in graph.upto(LAST)}
+    return {name: closure.digest(module) for name, module in (modules | {"scores": "pipeline.trade.scores"}).items()}
 
 
 def said_of(point: Point) -> Row:
