@@ -5,7 +5,9 @@ Covariance: the plate's pose covariance turned into the plane's tilt and offset 
 and lens covariance, with their correlation, projected to pixels at the foot of each object. Rectangle: the board and
 every object with ``extent`` object sizes around; half the board's shorter side (a marker's side, without either a tenth
 of the camera's height) stands for the size of an object, as meshes are not read here. What lies behind the plate camera
-is cut off. Limits: one flat surface; objects much larger than the board need a larger ``extent``.
+is cut off. Where further views were adjusted with the markers, a plane is fitted to their cloud (robust, weighted) and
+its agreement with the markers' is tested; the markers' plane stays the world's. Limits: one flat surface; objects much
+larger than the board need a larger ``extent``.
 """
 
 from __future__ import annotations
@@ -14,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.camera.lens import project_jacobians
+from pipeline.camera.cloud_plane import AGREE_CHI2, CloudPlane, plane_of_cloud
+from pipeline.camera.lens import project, project_jacobians
 from pipeline.camera.rigid import camera_points
-from pipeline.run.artifacts import CAMERA, FACTS, PLANE, VIEWS, WISHES
+from pipeline.run.artifacts import CAMERA, CLOUD, FACTS, PLANE, VIEWS, WISHES
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Plane, Result, View
+from pipeline.types import Camera, Plane, Reconstruction, Result, View
 from stages import knobs
 
 EDGE_ON_DEG, GRAZING_DEG = 1.0, 5.0  # elevation of the camera over the plane, seen from a foot: refused, warned of
@@ -31,8 +34,9 @@ BISECTIONS = 50  # to rounding
 
 
 def compute(
-    facts: dict[str, Any], wishes: dict[str, Any], camera: Camera, views: dict[str, View], params: knobs.Plane
-) -> Result:
+    facts: dict[str, Any], wishes: dict[str, Any], camera: Camera, views: dict[str, View], cloud: Reconstruction,
+    params: knobs.Plane,
+) -> Result:  # fmt: skip
     """Plane ``y = 0`` of the world with covariance, the modelled rectangle, and the contact uncertainty in pixels."""
     view = views["plate"]
     height = float(view.world_from_camera[1, 3])
@@ -71,7 +75,42 @@ def compute(
                         float(corners[:, 0].max()), float(corners[:, 2].max())],
         "margin_kept": kept,
     }  # fmt: skip
-    return Result({"plane": plane}, numbers, warnings, evidence(view))
+    found = plane_of_cloud(cloud, height, corners) if len(cloud.points) else None
+    shown = None
+    if found is not None:
+        numbers["cloud"] = shown = against_cloud(found, covariance, spots, camera, view, warnings)
+    return Result({"plane": plane}, numbers, warnings, evidence(view, shown))
+
+
+def against_cloud(
+    found: CloudPlane, covariance: np.ndarray, spots: dict[str, np.ndarray], camera: Camera, view: View,
+    warnings: list[str],
+) -> dict[str, Any]:  # fmt: skip
+    """The surface that the cloud shows against the markers' plane: figures, and a warning where they differ.
+
+    ``covariance`` (3, 3): of the markers' plane. At each spot (3,) the surface's height [m] and its cost [px].
+    """
+    heights = {name: found.height(spot) for name, spot in spots.items()}
+    shifts = {}
+    for name, spot in spots.items():
+        ends = camera_points(view.world_from_camera, np.array([spot, spot + np.array([0, heights[name], 0])]))[0]
+        shifts[name] = float(np.linalg.norm(np.diff(project(camera, ends), axis=0)))
+    chi2 = found.chi2(covariance)
+    if chi2 > AGREE_CHI2:
+        worst = max(spots, key=lambda name: abs(heights[name]))
+        warnings.append(
+            f"plane: the surface that further views show is {1000 * heights[worst]:+.2f} mm off the markers' plane "
+            f"at {worst} ({shifts[worst]:.2f} px; chi2 {chi2:.0f}, expected below {AGREE_CHI2:.0f}): are markers "
+            "flat, on thin paper? [[object]] lift_m corrects the height"
+        )
+    sigma = np.sqrt(np.diag(found.covariance))
+    return {
+        "points": found.points, "tilt_deg": float(np.degrees(np.hypot(*found.fit[:2]))),
+        "offset_m": float(found.fit[2]), "offset_sigma_m": float(sigma[2]),
+        "tilt_sigma_deg": float(np.degrees(np.hypot(*sigma[:2]))),
+        "scatter_m": found.scatter_m, "uneven_m": found.uneven_m, "chi2": chi2, "agrees": chi2 <= AGREE_CHI2,
+        "height_m": heights, "shift_px": shifts,
+    }  # fmt: skip
 
 
 def marker_rectangle(facts: dict[str, Any], camera_height_m: float) -> tuple[np.ndarray, float]:
@@ -188,13 +227,20 @@ def contact_sigma(camera: Camera, view: View, spot: np.ndarray) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
 
 
-def evidence(view: View) -> list[dict[str, Any]]:
-    """The model ladder of the plane."""
+def evidence(view: View, cloud: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The model ladder of the plane; ``cloud``: figures of what further views show of it."""
+    uneven = "no points off the board are measured"
+    if cloud is not None:
+        uneven = (
+            f"{cloud['points']} points scatter by {1000 * cloud['scatter_m']:.2f} mm about a plane that is "
+            f"{cloud['tilt_deg']:.3f} deg and {1000 * cloud['offset_m']:+.2f} mm off the markers' "
+            f"(chi2 {cloud['chi2']:.1f})"
+        )
     return [
         {"term": "plane", "modelled": True, "because": f"defined by the pose ({view.route})", "could_cost": ""},
         {
             "term": "unevenness of the surface, paper thickness", "modelled": False,
-            "because": "no points off the board are measured",
+            "because": uneven,
             "could_cost": "contact and shadow shift by the height error times the cotangent of the light's elevation",
         },
         {
@@ -208,6 +254,6 @@ STAGE = Stage(
     "plane",
     compute,
     knobs.Plane,
-    {"facts": FACTS, "wishes": WISHES, "camera": CAMERA, "views": VIEWS},
+    {"facts": FACTS, "wishes": WISHES, "camera": CAMERA, "views": VIEWS, "cloud": CLOUD},
     {"plane": PLANE},
 )

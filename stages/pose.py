@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera import board_doubts
+from pipeline.camera.cloud_plane import in_world
 from pipeline.camera.lens import project
 from pipeline.camera.marker_map import MarkerMap, residuals_of, with_tripod
 from pipeline.camera.markers import grey
@@ -34,6 +35,7 @@ from pipeline.camera.survey import resect_points
 from pipeline.image.colour import decode_srgb
 from pipeline.run.artifacts import (
     CAMERA,
+    CLOUD,
     FACTS,
     PHOTOGRAPHS,
     RECONSTRUCTION,
@@ -85,9 +87,10 @@ def compute(
     tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
     asked = [name for name, order in orders.items() if order["route"] == "colmap"]
     extra: dict[str, Any] = {}
+    cloud = Reconstruction()
     if asked:
-        placed, extra = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
-        views |= placed
+        found = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
+        views, extra, cloud = views | found[0], found[1], found[2]
     places: dict[str, Any] = {}
     if mapped:
         by_marker = by_map(facts, mapped, tripod, photographs, cameras, view_photos, params, warnings)
@@ -107,7 +110,7 @@ def compute(
         numbers[name]["tripod_shift_px"] = shift
     numbers |= {key: part for key, part in (("sfm", extra), ("marker_map", places)) if part}
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
-    return Result({"views": result}, numbers, warnings, reasons(orders, views, list(cameras.values())))
+    return Result({"views": result, "cloud": cloud}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
 
 def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:
@@ -132,8 +135,8 @@ def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[s
 def by_views(
     facts: dict[str, Any], asked: list[str], tripod: list[str], photographs: dict[str, Raster], camera: Camera,
     reconstruction: Reconstruction, view_photos: list[Frame], warnings: list[str],
-) -> tuple[dict[str, View], dict[str, Any]]:  # fmt: skip
-    """Poses of the views that asked for it from all photographs together, and the numbers of that adjustment."""
+) -> tuple[dict[str, View], dict[str, Any], Reconstruction]:  # fmt: skip
+    """Poses of the views that asked for it from all photographs together, the numbers of that adjustment, its cloud."""
     lost = [name for name in asked if name not in reconstruction.names]
     if lost:
         raise CaptureError(
@@ -181,7 +184,7 @@ def by_views(
             warnings.append(
                 f"{name}: the tripod moved by {np.linalg.norm(apart[3:]) * 1000:.1f} mm; its own pose is used"
             )
-    return views, numbers
+    return views, numbers, in_world(reconstruction, done, cameras)
 
 
 def linear_of(file: Path) -> np.ndarray:
@@ -508,12 +511,8 @@ STAGE = Stage(
     compute,
     knobs.Pose,
     {
-        "facts": FACTS,
-        "photographs": PHOTOGRAPHS,
-        "camera": CAMERA,
-        "view_cameras": VIEW_CAMERAS,
-        "reconstruction": RECONSTRUCTION,
-        "view_photos": VIEW_PHOTOS,
+        "facts": FACTS, "photographs": PHOTOGRAPHS, "camera": CAMERA, "view_cameras": VIEW_CAMERAS,
+        "reconstruction": RECONSTRUCTION, "view_photos": VIEW_PHOTOS,
     },
-    {"views": VIEWS},
-)
+    {"views": VIEWS, "cloud": CLOUD},
+)  # fmt: skip

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from printed_board import BOARD, looking_at
 
+from pipeline.camera.cloud_plane import plane_of_cloud
 from pipeline.camera.lens import project
 from pipeline.camera.resection import refine
 from pipeline.camera.rigid import camera_points, perturb
 from pipeline.run.errors import CaptureError, ManifestError
-from pipeline.types import Camera, View
+from pipeline.types import Camera, Reconstruction, View
 from stages import knobs, plane
 
 CAMERA = Camera(width=640, height=480, fx=700, fy=700, cx=320, cy=240)
@@ -29,7 +30,7 @@ def view_of(pose: np.ndarray, **changes) -> View:
 
 def run(pose: np.ndarray = POSE, objects: list | None = None, **params):
     wishes = {"object": [{"name": f"thing{i}", "position_m": p} for i, p in enumerate(objects or [])]}
-    return plane.compute(FACTS, wishes, CAMERA, {"plate": view_of(pose)}, knobs.Plane(**params))
+    return plane.compute(FACTS, wishes, CAMERA, {"plate": view_of(pose)}, Reconstruction(), knobs.Plane(**params))
 
 
 def test_plane_is_the_board_and_faces_up() -> None:
@@ -134,9 +135,11 @@ def test_refusals() -> None:
 
 def test_marker_and_bare_worlds() -> None:
     params, views = knobs.Plane(), {"plate": view_of(looking_at(np.zeros(3), 40, 0, 2.0))}
-    marked = plane.compute({"board": None, "marker": [{"side_m": 0.1}]}, {"object": []}, CAMERA, views, params)
+    marked = plane.compute(
+        {"board": None, "marker": [{"side_m": 0.1}]}, {"object": []}, CAMERA, views, Reconstruction(), params
+    )
     np.testing.assert_allclose(marked.numbers["rectangle_m"], [-0.85, -0.85, 0.85, 0.85])
-    bare = plane.compute({"board": None, "marker": None}, {"object": []}, CAMERA, views, params)
+    bare = plane.compute({"board": None, "marker": None}, {"object": []}, CAMERA, views, Reconstruction(), params)
     assert bare.numbers["rectangle_m"][2] == pytest.approx(8 * 0.1 * 2.0 * np.cos(np.radians(40)))
 
 
@@ -145,5 +148,80 @@ def test_scale_of_the_world_does_not_matter(scale: float) -> None:
     moved = POSE.copy()
     moved[:3, 3] *= scale
     facts = {"board": {**FACTS["board"], "square_m": 0.03 * scale, "margin_m": 0.01 * scale}, "marker": None}
-    result = plane.compute(facts, {"object": []}, CAMERA, {"plate": view_of(moved)}, knobs.Plane())
+    result = plane.compute(facts, {"object": []}, CAMERA, {"plate": view_of(moved)}, Reconstruction(), knobs.Plane())
     np.testing.assert_allclose(result.numbers["rectangle_m"], np.array(run().numbers["rectangle_m"]) * scale)
+
+
+def cloud(tilt: tuple[float, float], offset_m: float, seed: int, standing: float = 0.3) -> Reconstruction:
+    """400 points of a surface (and as many more shares that stand on it), seen by six cameras with 0.25 px of noise.
+
+    Linear triangulation of the noisy sightings; surface uneven by 0.2 mm.
+    """
+    rng = np.random.default_rng(seed)
+    x, z = rng.uniform(-0.2, 0.4, (2, 400))
+    y = offset_m + tilt[1] * x - tilt[0] * z + 2e-4 * rng.normal(size=400)
+    y = np.where(rng.uniform(size=400) < standing, y + rng.uniform(2e-3, 0.1, 400), y)
+    truth = np.stack([x, y, z], -1)
+    poses = np.array([looking_at(CENTRE, 45, 60 * n, 0.6) for n in range(6)])
+    total, right = np.zeros((400, 3, 3)), np.zeros((400, 3))
+    for pose in poses:
+        local = (truth - pose[:3, 3]) @ pose[:3, :3]
+        px = local[:, :2] / local[:, 2:] * 700 + 0.25 * rng.normal(size=(400, 2))
+        ray = np.concatenate([px / 700, np.ones((400, 1))], -1) @ pose[:3, :3].T
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        total, right = total + across, right + across @ pose[:3, 3]
+    view, point = np.divmod(np.arange(2400), 400)
+    return Reconstruction(
+        method="incremental", names=list("abcdef"), world_from_camera=poses, cameras=[CAMERA], px=np.zeros((2400, 2)),
+        camera_of=np.zeros(6, int), points=np.linalg.solve(total, right[..., None])[..., 0],
+        seen_view=view, seen_point=point,
+    )  # fmt: skip
+
+
+CORNERS = np.array([[-0.3, 0, 0.5], [0.5, 0, 0.5], [0.5, 0, -0.3], [-0.3, 0, -0.3]])
+
+
+def test_plane_of_a_cloud_with_things_standing_on_it() -> None:
+    """Coverage of the 95 % region of (tilts, offset) over 150 clouds of which 30 % stand on the surface, 90 to 99 %.
+
+    Expected 95 with a standard error of 1.8. What stands by less than the scatter lifts the fit by a few of its own
+    deviations at most, so the bias is tested apart: below 0.05 mm and 0.01 degrees.
+    """
+    truth = np.array([2e-3, -1e-3, 1.2e-3])
+    inside, errors = 0, []
+    for seed in range(150):
+        found = plane_of_cloud(cloud((truth[0], truth[1]), truth[2], seed, 0.0), 0.42, CORNERS)
+        assert found is not None
+        error = found.fit - truth
+        inside += error @ np.linalg.solve(found.covariance, error) < 7.815
+    assert 0.90 <= inside / 150 <= 0.99
+    for seed in range(10):
+        found = plane_of_cloud(cloud((truth[0], truth[1]), truth[2], 1000 + seed), 0.42, CORNERS)
+        assert found is not None
+        errors.append(found.fit - truth)
+    tilt_x, tilt_z, offset = np.abs(np.mean(errors, 0))
+    assert np.degrees(max(tilt_x, tilt_z)) < 0.01
+    assert offset < 5e-5
+
+
+@pytest.mark.parametrize(("offset_m", "agrees"), [(0.0, True), (-3e-3, False)])
+def test_markers_against_the_cloud(offset_m: float, agrees: bool) -> None:
+    """Markers on a 3 mm card are noticed, and what that costs at the foot: px = f h cos(elevation) / distance."""
+    wishes = {"object": [{"name": "thing", "position_m": (CENTRE[0], CENTRE[2])}]}
+    views = {"plate": view_of(POSE, covariance=COVARIANCE * 0.01)}
+    result = plane.compute(FACTS, wishes, CAMERA, views, cloud((0, 0), offset_m, 7), knobs.Plane())
+    numbers = result.numbers["cloud"]
+    assert numbers["agrees"] is agrees
+    assert any("off the markers' plane at thing" in text for text in result.warnings) == (not agrees)
+    assert numbers["height_m"]["thing"] == pytest.approx(offset_m, abs=1e-4)
+    px = 700 * abs(offset_m) * np.sin(np.radians(45)) / 0.6
+    assert numbers["shift_px"]["thing"] == pytest.approx(px, abs=0.1)
+
+
+def test_a_cloud_that_tells_nothing() -> None:
+    few = cloud((0, 0), 0.0, 1)
+    assert plane_of_cloud(few, 0.42, CORNERS + 5) is None
+    line = few.model_copy(update={"points": few.points * (1, 1, 0)})
+    assert plane_of_cloud(line, 0.42, CORNERS) is None
+    assert "cloud" not in run().numbers

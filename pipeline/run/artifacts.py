@@ -62,6 +62,10 @@ RECONSTRUCTION = Artifact(
 )  # fmt: skip
 CAMERA = Artifact("camera", "json", "the plate's intrinsics, distortion, covariance", "px", type=Camera)
 VIEW_CAMERAS = Artifact("view_cameras", "json", "cameras of views that have their own", "px", type=dict[str, Camera])
+CLOUD = Artifact(
+    "cloud", "json", "poses and cloud of all photographs, adjusted with the markers, in the world; empty without", "m",
+    type=Reconstruction,
+)  # fmt: skip
 VIEWS = Artifact("views", "json", "pose of every view with covariance", "m, rad", type=dict[str, View])
 
 BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", type=dict[str, BallFit])
