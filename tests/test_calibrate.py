@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from printed_board import BOARD, looking_at
+from printed_board import BOARD, charuco_print, looking_at, photograph
 
 from pipeline.camera import opencv_bridge
 from pipeline.camera.adjustment import adjust, free_columns, lens_vector
 from pipeline.camera.lens import project
+from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.rigid import camera_points
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
@@ -104,7 +106,6 @@ def test_covariance_holds_the_truth() -> None:
 
 
 def test_agrees_with_opencv() -> None:
-    cv2 = pytest.importorskip("cv2")
     poses = poses_of(8, (10, 50), 5)
     corners = corners_of(poses, TRUTH, 0.1, 5)
     start, found = opencv_bridge.first_calibration([POINTS] * 8, corners, (1024, 768))
@@ -193,3 +194,96 @@ def test_captures_with_known_lens(folder: Path, truth: Camera) -> None:
     assert abs(camera.fx / truth.fx - 1) < 1e-3  # measured 1e-4 and 4e-4
     assert np.hypot(camera.cx - truth.cx, camera.cy - truth.cy) < 1.0  # measured 0.17 and 0.57 px
     assert calibrate.disagreement(truth, camera) < 1.0  # measured 0.2 and 0.6 px rms over the frame
+
+
+def test_boards_in_one_corner_and_few_are_flagged_with_what_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    everywhere = poses_of(60, (10, 50), 9)
+    low_right = [p for p in everywhere if (project(TRUTH, camera_points(p, POINTS)[0]) > (300, 200)).all()]
+    result = run(monkeypatch, corners_of(low_right[:7], TRUTH, 0.03, 9))
+    text = "\n".join(result.warnings)
+    assert "upper left" in text
+    assert "extrapolated" in text
+    assert "photograph next: a board in the" in text
+    few = run(monkeypatch, corners_of(poses_of(4, (10, 50), 10), TRUTH, 0.03, 10))
+    assert any("4 photographs, needed 6" in text for text in few.warnings)
+    assert any("photograph next" in text for text in few.warnings)
+
+
+def test_a_shifted_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The principal point off by 20 % of the frame, as a shift lens puts it; the start assumes the middle."""
+    shifted = TRUTH.model_copy(update={"cx": 0.7 * 1024, "cy": 0.35 * 768, "distortion": np.array([-0.05, 0, 0, 0, 0])})
+    result = run(monkeypatch, corners_of(poses_of(14, (5, 50), 12), shifted, 0.03, 12))
+    camera = result.outputs["camera"]
+    error = (lens_vector(camera) - lens_vector(shifted))[[0, 2, 3, 4]]
+    assert (np.abs(error) <= 4 * np.sqrt(np.diag(camera.covariance))[[0, 2, 3, 4]]).all()
+    assert calibrate.disagreement(shifted, camera) < 1.0
+
+
+def fisheye_corners(poses: list[np.ndarray], focal: float, sigma: float) -> list[np.ndarray]:
+    """Equidistant projection, r = f theta, with its centre in the middle of the frame."""
+    rng = np.random.default_rng(13)
+    corners = []
+    for pose in poses:
+        points = camera_points(pose, POINTS)[0]
+        across = np.hypot(points[:, 0], points[:, 1])
+        radius = focal * np.arctan2(across, points[:, 2])
+        px = points[:, :2] / across[:, None] * radius[:, None] + (512, 384)
+        corners.append(px + sigma * rng.normal(size=px.shape))
+    return corners
+
+
+def wide_poses() -> list[np.ndarray]:
+    """Boards over a frame of 150 degrees across: near, and in every direction."""
+    rng, poses = np.random.default_rng(14), []
+    for turn in np.linspace(0, 2 * np.pi, 16, endpoint=False):
+        for off in (0.3, 0.95):
+            pose = looking_at(np.array([0.1, 0, 0.07]), rng.uniform(0, 35), rng.uniform(0, 360), 0.16)
+            c, s, a, b = np.cos(off), np.sin(off), np.cos(turn), np.sin(turn)
+            axis = np.array([[0, 0, b], [0, 0, -a], [-b, a, 0]])
+            pose[:3, :3] = pose[:3, :3] @ (np.eye(3) + s * axis + (1 - c) * axis @ axis)
+            poses.append(pose)
+    return poses
+
+
+@pytest.mark.parametrize("focal", [390.0, 600.0])
+def test_a_fisheye_is_refused(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
+    """150 and 98 degrees across, equidistant: Brown's terms fold within the frame, which is said with that word."""
+    corners = [
+        px for px in fisheye_corners(wide_poses(), focal, 0.03) if (px > 0).all() and (px < (1024, 768)).all()
+    ]  # fmt: skip
+    with pytest.raises(NumericalError, match="fisheye"):
+        run(monkeypatch, corners)
+
+
+def test_a_mild_fisheye_is_within_browns_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """51 degrees across, equidistant: what Brown leaves is in the evidence, and below the corners' noise of 0.03 px."""
+    result = run(monkeypatch, fisheye_corners(poses_of(14, (5, 50), 15), 1150.0, 0.03))
+    row = next(row for row in result.evidence if "fisheye" in row["term"])
+    assert not row["modelled"]
+    assert float(row["could_cost"].split()[0]) < 0.02
+    assert result.numbers["rms_px"] < 0.05
+
+
+def test_bad_board_frames_are_named(tmp_path: Path) -> None:
+    """Rendered pictures: five good ones, one half out of the frame, one out of focus, one of another board."""
+    lens = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1)
+    printed, other = charuco_print(BOARD), charuco_print({**BOARD, "dictionary": "DICT_4X4_50"})
+    middle = np.array([0.105, 0, 0.075])
+    for number, (tilt, azimuth) in enumerate([(35, 0), (35, 90), (40, 180), (35, 270), (10, 45)]):
+        save(tmp_path / f"good_{number}.png", photograph(printed, lens, looking_at(middle, tilt, azimuth, 0.42), 3))
+    pose = looking_at(middle, 30, 200, 0.42)
+    save(tmp_path / "half.png", photograph(printed, lens, looking_at(middle + np.array([0.13, 0, 0]), 30, 20, 0.42), 3))
+    save(tmp_path / "blurred.png", cv2.GaussianBlur(photograph(printed, lens, pose, 3), (0, 0), 7))
+    save(tmp_path / "other.png", photograph(other, lens, pose, 3))
+    facts = {"capture_root": str(tmp_path), "board": BOARD, "camera": {"calibration": ["*"], "given": None}}
+    files = [{"file": path.name} for path in sorted(tmp_path.glob("*.png"))]
+    result = calibrate.compute(facts, {}, files, Reconstruction(), knobs.Calibrate())
+    left_out = [text.split(":")[0] for text in result.warnings if "left out" in text]
+    assert left_out == ["blurred.png", "other.png"]
+    assert "half.png" in result.numbers["photo_rms_px"]
+    camera = result.outputs["camera"]
+    assert abs(camera.fx - 640) < 4 * np.sqrt(camera.covariance[0, 0])
+
+
+def save(path: Path, light: np.ndarray) -> None:
+    cv2.imwrite(str(path), np.uint8(np.clip(tone(light) * 255, 0, 255)))

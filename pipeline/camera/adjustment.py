@@ -134,11 +134,16 @@ def _finish(
 ) -> Adjustment:
     """Residuals and the covariance, scaled by chi2 per degree of freedom."""
     lens_lens, cross, pose_pose, _, cost = system
+    if not np.isfinite(cost):
+        raise NumericalError(
+            f"calibrate: no lens of Brown's model images all corners of {len(poses)} board photographs; a fisheye is "
+            "not modelled; if it is none, check squares and square_m of [board]"
+        )
     residuals = [residuals_and_jacobian(camera, *item)[0] for item in zip(poses, world_m, px, strict=True)]
     reduced = lens_lens - sum(c @ np.linalg.solve(p, c.T) for c, p in zip(cross, pose_pose, strict=True))
     scale = np.sqrt(np.maximum(np.diag(lens_lens), 1e-300))
     scaled = reduced / np.outer(scale, scale)
-    if not np.isfinite(cost) or not np.isfinite(scaled).all() or np.linalg.eigvalsh(scaled)[0] < 1e-12:
+    if not np.isfinite(scaled).all() or np.linalg.eigvalsh(scaled)[0] < 1e-12:
         raise NumericalError(
             f"calibrate: {len(poses)} board photographs do not fix the lens, needed different tilts; take some "
             "with the board tilted 30 to 45 degrees in several directions"

@@ -28,6 +28,8 @@ def fold_radius_squared(distortion: np.ndarray) -> float:
 
 @functools.lru_cache(maxsize=64)
 def _fold(k1: float, k2: float, k3: float) -> float:
+    if not np.isfinite((k1, k2, k3)).all():
+        return 0.0  # a step of an adjustment that ran away: it images nothing
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))].real
     return float(min(real[real > 0], default=np.inf))
