@@ -20,7 +20,7 @@ from pipeline.probes.finding import Found, complaints
 from pipeline.probes.outline import Height
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Frame, Raster, Reconstruction
-from stages import calibrate, knobs, pose
+from stages import calibrate, ingest, knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1)
 CENTRE = np.array([0.105, 0, 0.075])
@@ -273,3 +273,25 @@ def test_a_print_of_another_size_is_told_by_the_ball(stated):
     said = [text for text in complaints("ball_a", ball, radius) if "off the plane" in text]
     assert bool(said) == (stated != 1.0)
     assert all(f"measures {1 / stated:.1%} +- 0.0% of its stated size" in text for text in said)
+
+
+def test_metadata_of_files_are_asked(tmp_path):
+    """Through ingest: EXIF of JPEG files; one without says nothing and is let pass."""
+    from PIL import Image
+
+    for number, mm in enumerate((24.0, 24.0, 35.0, None)):
+        exif = Image.Exif()
+        if mm is not None:
+            exif.get_ifd(0x8769)[0x920A] = mm  # FocalLength
+        Image.new("L", (64, 48), 128).save(tmp_path / f"{number}.jpg", exif=exif)
+    facts = SimpleNamespace(camera=SimpleNamespace(calibration=["*.jpg"]), ball=[])
+    problems: list[str] = []
+    flaws: list[str] = []
+    photos, frames = ingest._board_photos(facts, tmp_path, tmp_path / "capture.toml", problems, flaws)  # type: ignore[arg-type]
+    assert len(photos) == 4
+    assert not problems
+    assert flaws == ["2.jpg: focal length 35 mm, the other board photographs 24 mm; needed one; take it out"]
+    plate = SimpleNamespace(role="plate", frames=[frame("p.dng", focal_mm=35.0)])
+    flaws.clear()
+    ingest._check_zoom({"plate": plate}, {"plate": frames["plate"][:2]}, flaws, [])  # type: ignore[dict-item]
+    assert flaws[0].startswith("plate: taken at 35 mm, its board photographs at 24 mm; needed one focal length")
