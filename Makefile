@@ -70,6 +70,12 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
+trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/<capture>/trade (an hour or more)
+	@$(INSITU) trade $(CAPTURE) --out $(OUT)
+
+speed: trade  ## regenerate docs/speed.md and its picture from the trade of CAPTURE
+	@cp $(OUT)/trade/trade.md docs/speed.md && cp $(OUT)/trade/trade.svg docs/trade.svg
+
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)
 
@@ -105,4 +111,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: trade speed bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE

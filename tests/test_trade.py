@@ -138,6 +138,21 @@ def test_combinations_are_of_knobs_that_mattered():
     assert points.combinations({}, "preview") == []
 
 
+def test_combinations_are_foretold_from_knobs_alone():
+    """One stage: 30 s times a half times 26/30; errors by their squares."""
+    both = front.predicted({"render.samples": 8, "probe.width": 512}, ROWS)
+    assert both == {
+        "cpu_seconds": pytest.approx(30 * 15 / 30 * 26 / 30),
+        "changed_rel_err": pytest.approx(np.sqrt(0.035**2 + 0.024**2 - 0.021**2)),
+    }
+    assert front.predicted({}, ROWS) == {"cpu_seconds": 30.0, "changed_rel_err": pytest.approx(0.021)}
+    assert front.predicted({"render.depth": 2}, ROWS) is None  # not measured alone
+    assert front.predicted({"merge.weights": "poisson"}, ROWS) is None  # without a figure
+    combined = row("a b", "design", 14.0, 0.04, render__samples=8, probe__width=512)
+    assert page.combinations_table([*ROWS, combined])[-1] == "| `a b` | 14.0 | 13.0 | 0.0400 | 0.0369 |"
+    assert page.combinations_table(ROWS) == []
+
+
 def about() -> dict:
     told = {"capture": "made_up", "against": "truth", "base": "preview", "cores": 2, "machine": "x86_64", "repeats": 2}
     return {**told, "noise": front.noise(ROWS)}

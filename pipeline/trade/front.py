@@ -137,3 +137,25 @@ def betterers(rows: Sequence[Row], most: int = 4) -> dict[str, Any]:
             best[knob] = gain, value
     ranked = sorted(best, key=lambda knob: -best[knob][0])[:most]
     return {knob: best[knob][1] for knob in ranked}
+
+
+def predicted(changes: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float] | None:
+    """``cpu_seconds`` and `MAIN` of a combination, from its knobs alone; None when one of them was not measured.
+
+    Costs of one stage multiply by what each knob alone multiplies them by; errors are taken as independent, so that
+    their squares add: ``e^2 = e_0^2 + sum (e_i^2 - e_0^2)``, at least 0. How far this is right is what the designed
+    combinations measure.
+    """
+    base = base_of(rows)
+    single = {knob: row for row in rows if row["kind"] == "knob" and "failed" not in row for knob in row["changes"]
+              if row["changes"] == {knob: changes.get(knob)}}  # fmt: skip
+    errors = [row["errors"].get(MAIN) for row in (base, *single.values())]
+    if single.keys() != changes.keys() or None in errors:
+        return None
+    cost = 0.0
+    for name, stage in base["stages"].items():
+        ratios = [row["stages"][name]["cpu_seconds"] / stage["cpu_seconds"] for row in single.values()
+                  if stage["cpu_seconds"] > 0]  # fmt: skip
+        cost += stage["cpu_seconds"] * math.prod(ratios)
+    square = errors[0] ** 2 + sum(error**2 - errors[0] ** 2 for error in errors[1:])
+    return {"cpu_seconds": cost, MAIN: math.sqrt(max(0.0, square))}

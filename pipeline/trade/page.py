@@ -25,13 +25,16 @@ process held resident in any stage.
 
 {noise}
 """
+COMBINED = """Measured beside what the knobs alone foretell: costs of one stage multiply, squares of errors add. Where
+the two differ, knobs work on each other."""
 TABLE = "| settings | {figures} | CPU s | wall s | memory [MB] | front |"
 
 
 def write(root: Path, rows: Sequence[Row], about: dict[str, Any]) -> list[Path]:
     """Write the four files; returns their paths, the page last."""
     rows = flagged(rows)
-    record = {**about, "points": rows, "buys": front.buys(rows)}
+    foretold = {row["label"]: front.predicted(row["changes"], rows) for row in rows if row["kind"] == "design"}
+    record = {**about, "points": rows, "buys": front.buys(rows), "predicted": foretold}
     files = {
         "trade.json": json.dumps(record, indent=1) + "\n",
         "trade.csv": as_csv(rows),
@@ -75,6 +78,8 @@ def markdown(rows: Sequence[Row], about: dict[str, Any]) -> str:
     """The page."""
     lines = [INTRODUCTION.format(**about | {"noise": noise_words(about)}), "![error over CPU seconds](trade.svg)", ""]
     lines += ["## What each knob buys", "", *buys_table(rows, about["base"]), ""]
+    if combined := combinations_table(rows):
+        lines += ["## Combinations", "", COMBINED, "", *combined, ""]
     on_front = [row for row in rows if front.is_measured(row) and row["front"][front.MAIN]]
     lines += [
         "## The front",
@@ -117,6 +122,18 @@ def buys_table(rows: Sequence[Row], base: str) -> list[str]:
         shown = entry["knob"]
         lines.append(f"| {name} | {json.dumps(entry['value'])} | {' | '.join(cells)} |")
     return lines if settings else [f"No knob was tried alone against `{base}`."]
+
+
+def combinations_table(rows: Sequence[Row]) -> list[str]:
+    """Markdown: designed combinations, measured and predicted; nothing when there are none."""
+    chosen = [row for row in rows if row["kind"] == "design" and "failed" not in row]
+    lines = [f"| settings | CPU s | predicted | {NAMES[front.MAIN]} | predicted |", "|---|---:|---:|---:|---:|"]
+    for row in chosen:
+        guess = front.predicted(row["changes"], rows)
+        told = ("-", "-") if guess is None else (f"{guess['cpu_seconds']:.1f}", f"{guess[front.MAIN]:.4f}")
+        error = cell(row["errors"].get(front.MAIN), False, ".4f")
+        lines.append(f"| `{row['label']}` | {row['cpu_seconds']:.1f} | {told[0]} | {error} | {told[1]} |")
+    return lines if chosen else []
 
 
 def cell(value: float | None, chance: bool, form: str) -> str:
