@@ -2,13 +2,15 @@
 
 Method: corners are measured in the photograph itself and the pose minimises their reprojection error through the lens
 (Levenberg-Marquardt, Huber search, then least squares without outliers). Both poses that a plane allows (IPPE, Collins
-and Bartoli 2014) are refined; when the second is nearly as good the view is refused with both. Surveyed points go
-through LO-RANSAC (COLMAP). Views that show no marker are oriented by what they share with further photographs: tracks
-of the cloud and markers seen in any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse
-normal matrix times the larger of the stated corner variance and chi2 per degree of freedom, plus the camera's
-covariance carried through; corners are taken as independent. Views from one tripod position are tested for having
-stayed (chi2 of the difference) and then share one pose, estimated from their averaged corners. Limits: a flat board of
-the stated size; a wrong size scales the world unnoticed.
+and Bartoli 2014) are refined; when the second is nearly as good, a further marker decides, else a mirror ball of known
+diameter that stands on the plane of one, else the view is refused with both. Several markers are mapped from all views
+(`pipeline/camera/marker_map.py`). Surveyed points start by LO-RANSAC (COLMAP) and count by their own uncertainty. Views
+that show no marker are oriented by what they share with further photographs: tracks of the cloud and markers seen in
+any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse normal matrix times the larger of
+the stated corner variance and chi2 per degree of freedom, plus the camera's covariance carried through; corners are
+taken as independent. Views from one tripod position are tested for having stayed (chi2 of the difference) and then
+share one pose, estimated from their averaged corners. Limits: a flat board of the stated size; a wrong size scales the
+world unnoticed.
 """
 
 from __future__ import annotations
@@ -23,16 +25,18 @@ import numpy as np
 from pipeline.camera import board_doubts
 from pipeline.camera.cloud_plane import in_world
 from pipeline.camera.lens import project
-from pipeline.camera.marker_map import MarkerMap, residuals_of, with_tripod
+from pipeline.camera.map_report import report
+from pipeline.camera.marker_map import MarkerMap, with_tripod
 from pipeline.camera.markers import grey
 from pipeline.camera.opencv_bridge import Sightings, read_grey
 from pipeline.camera.resection import Resection, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.camera.sfm import Seen, oriented, scale_sigma, scaled_covariance
-from pipeline.camera.sights import FEWEST_CORNERS, marks_in
+from pipeline.camera.sights import FEWEST_CORNERS, averaged, marks_in
 from pipeline.camera.stated import rigid
 from pipeline.camera.survey import resect_points
 from pipeline.image.colour import decode_srgb
+from pipeline.probes.standing import standing_chi2
 from pipeline.run.artifacts import (
     CAMERA,
     CLOUD,
@@ -49,6 +53,7 @@ from pipeline.types import Camera, Frame, Raster, Reconstruction, Result, View
 from stages import knobs
 
 MOVED_CHI2 = 22.46  # 99.9 % of chi2 with six degrees of freedom
+STANDS_CHI2 = 10.8  # and with one: a ball higher or lower than this does not stand on the plane
 WIDE_ROTATION_DEG = 1.0
 LARGE_RMS_PX = 0.5
 FAR_M = 1e4  # from the origin: there single precision, which renders, has steps of a millimetre
@@ -63,6 +68,7 @@ class Estimate:
     best: Resection
     second: Resection | None
     ambiguity: float
+    decided: str = ""  # what told the two poses apart, beside the corners
 
 
 def compute(
@@ -98,9 +104,11 @@ def compute(
     for name in orders:
         if name not in tripod and name not in views:
             estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
-            views[name] = view_of(estimate) if isinstance(estimate, Estimate) else estimate
             if isinstance(estimate, Estimate):
+                estimate = by_ball(facts, name, estimate, photographs, cameras, params)
+                refuse_named(name, estimate, params)
                 estimates[name] = estimate
+            views[name] = view_of(estimate) if isinstance(estimate, Estimate) else estimate
     shifts = settle_tripod(tripod, sights, estimates, views, camera, params, warnings)
     numbers = {
         name: figures(name, view, estimates.get(name), sights.get(name), warnings) for name, view in views.items()
@@ -209,7 +217,6 @@ def by_map(
     found, moved = with_tripod(seen, lenses, here, params.corner_sigma_px, MOVED_CHI2)
     views: dict[str, View] = {}
     estimates: dict[str, Estimate] = {}
-    off = residuals_of(found)
     for name in asked:
         if name in here and "plate" in found.names and name not in found.names:
             continue  # it stayed, or shows nothing that says it did not: the plate's pose is its own
@@ -220,6 +227,8 @@ def by_map(
                 f"first ({facts['marker'][0]['id']}), needed one; photograph both in one picture as well"
             )
         estimates[name] = map_estimate(found, name, seen[name], cameras[name], params)
+        if name in found.lone:
+            estimates[name] = by_ball(facts, name, estimates[name], photographs, cameras, params)
         refuse_named(name, estimates[name], params)
         views[name] = view_of(estimates[name])
     for name, (chi2, shift) in moved.items():
@@ -228,7 +237,8 @@ def by_map(
     for name in here:
         if name not in views and "plate" in views:
             views[name] = views["plate"].model_copy(update={"route": "same_as"})
-    numbers = map_numbers(facts, found, off, params, warnings)
+    numbers, said = report(facts["marker"], found, params.min_ambiguity)
+    warnings += said
     return views, estimates, numbers | {"tripod_shift_px": {name: shift for name, (_, shift) in moved.items()}}
 
 
@@ -244,40 +254,9 @@ def map_estimate(found: MarkerMap, name: str, marks: list[Seen], camera: Camera,
         name in found.lone and found.lone[name].frontal,
     )  # fmt: skip
     other = found.alternatives.get(name)
-    second = None if other is None else replace(best, world_from_camera=other)
+    worse = best.chi2 + 2 * (found.ambiguity[name] - 1)
+    second = None if other is None else replace(best, world_from_camera=other, chi2=worse)
     return Estimate("marker", Sightings(world_m, px, ids, len(marks)), best, second, found.ambiguity[name])
-
-
-def map_numbers(
-    facts: dict[str, Any], found: MarkerMap, off: dict[tuple[str, int], np.ndarray], params: knobs.Pose,
-    warnings: list[str],
-) -> dict[str, Any]:  # fmt: skip
-    """Where each marker lies and how well that is known; warns about what does not fit."""
-    table = []
-    for at, marker in enumerate(found.markers):
-        sigma = np.sqrt(np.diag(found.done.marker_covariance[at]))
-        names = [name for name, number in off if number == marker]
-        rms = float(np.sqrt(np.concatenate([off[name, marker] ** 2 for name in names]).mean())) if names else 0.0
-        label = f"marker {facts['marker'][marker]['id']}"
-        table.append({
-            **{key: facts["marker"][marker][key] for key in ("dictionary", "id", "side_m")},
-            "world_from_marker": found.done.bundle.markers[at].tolist(), "seen_in": names, "rms_px": rms,
-            "rotation_sigma_deg": float(np.degrees(np.linalg.norm(sigma[:3]))),
-            "position_sigma_m": float(np.linalg.norm(sigma[3:])), "ambiguity": found.unsure.get(marker),
-        })  # fmt: skip
-        if found.unsure.get(marker, np.inf) < params.min_ambiguity:
-            warnings.append(f"{label}: two places explain the pictures; photograph it from another side as well")
-        if rms > LARGE_RMS_PX:
-            warnings.append(f"{label}: residual {rms:.2f} px; was it moved, is its side_m right, is the print flat?")
-    for name, marker in found.left_out:
-        warnings.append(f"{name}: marker {facts['marker'][marker]['id']} contradicts the other views and is left out")
-    lost = [m["id"] for number, m in enumerate(facts["marker"]) if number not in found.markers]
-    if lost:
-        warnings.append(f"markers {lost} hang together with no other; the map is without them")
-    return {
-        "markers": table, "corner_sigma_px": found.done.corner_sigma_px, "seen_by": found.names,
-        "left_out": [[name, facts["marker"][marker]["id"]] for name, marker in found.left_out],
-    }  # fmt: skip
 
 
 def check_sizes(photographs: dict[str, Raster], cameras: dict[str, Camera]) -> None:
@@ -323,7 +302,6 @@ def estimate_view(
             )
         best, second, ambiguity = resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px)
         estimate = Estimate(route, seen, best, second, ambiguity)
-        refuse_ambiguous(estimate, params)
     except (CaptureError, NumericalError) as error:
         raise type(error)(f"{name}: {error}") from error
     return estimate
@@ -345,9 +323,35 @@ def points_estimate(order: dict[str, Any], camera: Camera, params: knobs.Pose) -
     sigma_m = np.array([point.get("sigma_m") or 0.0 for point in points], float)
     found = resect_points(camera, world_m, px, sigma_px, sigma_m)
     seen = Sightings(world_m[found.agrees], px[found.agrees], np.flatnonzero(found.agrees), 0)
-    estimate = Estimate("points", seen, found.best, found.second, found.ambiguity)
-    refuse_ambiguous(estimate, params)
-    return estimate
+    return Estimate("points", seen, found.best, found.second, found.ambiguity)
+
+
+def by_ball(
+    facts: dict[str, Any], name: str, estimate: Estimate, photographs: dict[str, Raster], cameras: dict[str, Camera],
+    params: knobs.Pose,
+) -> Estimate:  # fmt: skip
+    """An ambiguous estimate decided by a ball that stands on the plane of one pose only; else as it was."""
+    probe = facts.get("probe") or {}
+    radius = 0.5 * (probe.get("diameter_m") or 0.0)
+    if estimate.second is None or estimate.ambiguity >= params.min_ambiguity or not radius:
+        return estimate
+    tripod = [ball["name"] for ball in facts["ball"] if ball.get("tripod")]
+    shown = name if name != "plate" else next(iter(tripod), None)
+    if shown is None or probe.get("kind", "mirror_ball") != "mirror_ball":
+        return estimate
+    plate = photographs["plate"] if shown in tripod else None
+    ways = [estimate.best, estimate.second]
+    poses = [view_of(replace(estimate, best=way)) for way in ways]
+    stands = standing_chi2(shown, photographs[shown], plate, cameras[shown], poses, radius)
+    if stands is None or stands.min() > STANDS_CHI2:
+        return estimate
+    total = np.array([way.chi2 for way in ways]) + stands
+    first, other = np.argsort(total)
+    freedom = max(2 * int(estimate.best.kept.sum()) - 5, 1)
+    ratio = float(total[other] / max(total[first], freedom))
+    if ratio < params.min_ambiguity:
+        return estimate
+    return replace(estimate, best=ways[first], second=ways[other], ambiguity=ratio, decided="ball")
 
 
 def refuse_named(name: str, estimate: Estimate, params: knobs.Pose) -> None:
@@ -416,9 +420,12 @@ def settle_tripod(
         views[name] = view_of(estimates[name])
     if plate is not None and pool:
         seen = averaged([plate.seen, *pool])
-        estimates["plate"] = Estimate(
-            plate.route, seen, *resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px)
-        )
+        if plate.decided:  # the corners alone may prefer the other pose
+            own = refine(camera, plate.best.world_from_camera, seen.world_m, seen.px, params.corner_sigma_px)
+            estimates["plate"] = replace(plate, seen=seen, best=own)
+        else:
+            found = resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px)
+            estimates["plate"] = Estimate(plate.route, seen, *found)
         views["plate"] = view_of(estimates["plate"])
     for name in names:
         if name not in views:
@@ -432,16 +439,6 @@ def moved_by(name: str, what: str, shift_px: float, chi2: float) -> str:
         f"{name}: the tripod moved: {what} shifted by {shift_px:.2f} px (chi2 {chi2:.0f}, expected below "
         f"{MOVED_CHI2:.0f}); its own pose is used"
     )
-
-
-def averaged(sightings: list[Sightings]) -> Sightings:
-    """Corners by id, the mean over the views that saw them: their scatter stays in the residuals, not counted twice."""
-    ids, where = np.unique(np.concatenate([seen.ids for seen in sightings]), return_inverse=True)
-    count = np.bincount(where)[:, None]
-    world_m, px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2))
-    np.add.at(world_m, where, np.concatenate([seen.world_m for seen in sightings]))
-    np.add.at(px, where, np.concatenate([seen.px for seen in sightings]))
-    return Sightings(world_m / count, px / count, ids, sightings[0].markers)
 
 
 def figures(
@@ -464,6 +461,8 @@ def figures(
             "distance_m": distance, "corner_sigma_px": estimate.best.sigma_px,
             "outliers": int((~estimate.best.kept).sum()), "position_sigma_rel": numbers["position_sigma_m"] / distance,
         }  # fmt: skip
+    if estimate is not None and estimate.decided:
+        numbers["decided_by"] = estimate.decided
     if estimate is not None and estimate.best.frontal:
         warnings.append(
             f"{name}: the {view.route} is seen so squarely that its tilt is hardly known ({rotation_deg:.2f} deg); "

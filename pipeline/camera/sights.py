@@ -72,3 +72,13 @@ def marks_in(facts: dict[str, Any], radiance: np.ndarray, camera: Camera) -> tup
         if len(sights.px):
             found.append(Seen(number, sights.world_m, sights.px))
     return found, notes
+
+
+def averaged(sightings: list[Sightings]) -> Sightings:
+    """Corners by id, the mean over the views that saw them: their scatter stays in the residuals, not counted twice."""
+    ids, where = np.unique(np.concatenate([seen.ids for seen in sightings]), return_inverse=True)
+    count = np.bincount(where)[:, None]
+    world_m, px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2))
+    np.add.at(world_m, where, np.concatenate([seen.world_m for seen in sightings]))
+    np.add.at(px, where, np.concatenate([seen.px for seen in sightings]))
+    return Sightings(world_m / count, px / count, ids, sightings[0].markers)
