@@ -160,6 +160,7 @@ def by_views(
         linear = linear_of(root / name) if name in files else grey(photographs[name].rgb())
         seen[name] = marks_in(facts, linear, lens)[0]
     done, markers = oriented(reconstruction, cameras, seen, None)
+    warnings += board_doubts.sizes_in_views(done.bundle, markers, facts.get("marker") or [])
     views: dict[str, View] = {}
     scale = scale_sigma(done)
     for number, name in enumerate(reconstruction.names):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from printed_board import BOARD, MARKER, charuco_print, looking_at, marker_print, photograph
+from test_bundle import noisy, world
 from test_calibrate import POINTS, TRUTH, corners_of, poses_of
 
 from pipeline.camera import board_doubts, view_checks
+from pipeline.camera.bundle import adjust
 from pipeline.camera.lens import project
 from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import board_sightings, first_calibration, repeated
@@ -295,3 +298,20 @@ def test_metadata_of_files_are_asked(tmp_path):
     flaws.clear()
     ingest._check_zoom({"plate": plate}, {"plate": frames["plate"][:2]}, flaws, [])  # type: ignore[dict-item]
     assert flaws[0].startswith("plate: taken at 35 mm, its board photographs at 24 mm; needed one focal length")
+
+
+@pytest.mark.parametrize("stated", [1.0, 1.004, 0.97, 1.05])
+def test_markers_that_contradict_each_other(stated):
+    """One of two markers stated ``stated`` times its size: told to half a per cent from ten views at 0.08 px."""
+    rng = np.random.default_rng(3)
+    made = noisy(world(rng), rng, 0.0)
+    corners = [replace(c, points=c.points * stated) if c.marker == 1 else c for c in made.corners]
+    done = adjust(replace(made, corners=corners))
+    marks = [{"id": 7, "side_m": 0.06}, {"id": 23, "side_m": 0.06 * stated}]
+    said = board_doubts.sizes_in_views(done.bundle, [0, 1], marks)
+    if abs(stated - 1) < 0.01:
+        assert said == []
+    else:
+        off = float(said[0].split("other by ")[1].split("%")[0]) / 100
+        assert off == pytest.approx(abs(np.expm1(abs(np.log(stated)))), abs=5e-3)
+        assert "markers 7 and 23" in said[0] or "markers 23 and 7" in said[0]

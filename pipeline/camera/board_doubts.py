@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.board_families import Layout, find_markers, layout_of
-from pipeline.camera.lens import project, unproject
+from pipeline.camera.bundle import Bundle, Corners
+from pipeline.camera.lens import pixel_rays, project, unproject
 from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import Sightings
-from pipeline.camera.rigid import camera_points
+from pipeline.camera.rigid import camera_points, umeyama
 from pipeline.camera.sights import FEWEST_CORNERS, eight_bit, sighted_board, sighted_marker
 from pipeline.conventions import WORLD_FROM_BOARD, transform_points
 from pipeline.run.errors import CaptureError
@@ -180,3 +181,49 @@ def wrong_size(marker: dict[str, Any], measured: tuple[float, float], unit: str)
         f"marker {marker['id']}: its side is {1000 * side:.1f} mm by the {unit}, side_m says "
         f"{1000 * marker['side_m']:.1f} mm ({ratio - 1:+.1%}); measure both prints"
     )
+
+
+def sizes_in_views(bundle: Bundle, numbers: Sequence[int], facts: Sequence[dict[str, Any]]) -> list[str]:
+    """What to say of markers whose sizes contradict each other in adjusted views.
+
+    ``numbers``: for each marker of the bundle, which of the stated ``facts`` it is.
+
+    Every marker's points are triangulated from the views that show it, apart from what is stated of it. The tracks hold
+    the views together, so the ratio of two markers stays what it is, though the scale is a compromise between them.
+    """
+    ratios: dict[int, tuple[float, float]] = {}
+    for number in range(len(bundle.markers)):
+        marks = [one for one in bundle.corners if one.marker == number]
+        found = _triangulated(bundle, marks)
+        if found is not None:
+            side_px = float(np.median([np.ptp(one.px, axis=0).max() for one in marks]))
+            ratios[number] = (umeyama(found, marks[0].points, scale=True)[1], CORNER_PX / side_px)
+    if len(ratios) < 2:
+        return []
+    small, large = (choose(ratios, key=lambda number: ratios[number][0]) for choose in (min, max))
+    apart = ratios[large][0] / ratios[small][0] - 1
+    if apart < max(SIZE_TOLERANCE, 4 * float(np.hypot(ratios[large][1], ratios[small][1]))):
+        return []
+    one, other = facts[numbers[small]], facts[numbers[large]]
+    return [
+        f"markers {one['id']} and {other['id']}: their sizes contradict each other by {apart:.1%} (stated "
+        f"{1000 * one['side_m']:.1f} and {1000 * other['side_m']:.1f} mm); measure both prints"
+    ]
+
+
+def _triangulated(bundle: Bundle, marks: Sequence[Corners]) -> np.ndarray | None:
+    """Points (n, 3) of a marker in the world, of the sight lines of all its views; None from one place."""
+    if not marks:
+        return None
+    total, right = np.zeros((len(marks[0].points), 3, 3)), np.zeros((len(marks[0].points), 3))
+    for one in marks:
+        if one.points.shape != marks[0].points.shape:
+            continue  # a board of which each view shows another part
+        pose = bundle.poses[one.view]
+        ray = pixel_rays(bundle.cameras[bundle.camera_of[one.view]], one.px) @ pose[:3, :3].T
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        total, right = total + across, right + across @ pose[:3, 3]
+    values = np.linalg.eigvalsh(total)
+    if (values[:, 0] < 1e-4 * values[:, 2]).any():  # sight lines that differ by less than half a degree
+        return None
+    return np.asarray(np.linalg.solve(total, right[..., None])[..., 0])
