@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from pipeline.camera.rigid import nearest_rotation
 from pipeline.camera.stated import FLIP, chan_matrix, chan_numbers, read_pose, rigid
 from pipeline.run.camera_facts import PoseFacts
 from pipeline.run.errors import ManifestError
+from stages import ingest
 
 
 def some_pose(seed: int) -> np.ndarray:
@@ -107,3 +109,19 @@ def test_stated_pose_is_rigid_and_stated_once() -> None:
         PoseFacts(view="plate", route="given", file="a.chan", world_from_camera=np.eye(4).tolist())
     with pytest.raises(ValidationError, match=r"expected one of .chan"):
         PoseFacts(view="plate", route="given", file="a.fbx")
+
+
+def test_ingest_reads_the_file_beside_the_manifest(tmp_path: Path) -> None:
+    position, degrees = chan_numbers(some_pose(1), "xyz")
+    numbers = " ".join(repr(float(value)) for value in (*position, *degrees))
+    (tmp_path / "camera.chan").write_text(f"7 {numbers}\n")
+    table = {"view": "plate", "route": "given", "file": "camera.chan", "rotation_order": "xyz"}
+    problems: list[str] = []
+    for frame in (7, 8):
+        facts = SimpleNamespace(pose=[PoseFacts.model_validate({**table, "frame": frame})])
+        dumped = ingest._poses(facts, tmp_path, tmp_path / "capture.toml", problems)
+        if frame == 7:
+            np.testing.assert_allclose(dumped[0]["world_from_camera"], some_pose(1), atol=1e-12)
+    assert len(problems) == 1
+    assert "pose[0].file" in problems[0]
+    assert "no frame 8" in problems[0]
