@@ -98,7 +98,8 @@ def normalised(points_camera: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     points = np.asarray(points_camera, float)
     ahead = points[..., 2] > 0
     xy = np.where(ahead[..., None], points[..., :2], np.nan) / np.where(ahead, points[..., 2], 1.0)[..., None]
-    return np.where(((xy**2).sum(-1) < fold_radius_squared(distortion))[..., None], xy, np.nan)
+    inner = xy[..., 0] ** 2 + xy[..., 1] ** 2 < fold_radius_squared(distortion)  # a sum over an axis of two is slow
+    return np.where(inner[..., None], xy, np.nan)
 
 
 def project(camera: Camera, points_camera: np.ndarray) -> np.ndarray:

@@ -180,48 +180,45 @@ def settle(
             along[0] = centre / radius  # a metre across is as many pixels as this is of size
         grid = centre + np.stack(np.meshgrid(*[offsets] * len(along)), -1).reshape(-1, len(along)) @ along
         azimuth = azimuths(int(np.clip(np.pi * typical, 60, 120 if step >= 1.0 else 360)))
-        counted = np.mean([_votes(signal, camera, grid, radius, blur, azimuth) for signal in signals], 0)
+        vote, framed = ballots(signals, camera, grid, radius, blur, azimuth)
+        counted = (vote.sum(-1) / np.maximum(framed.sum(-1), 1)).mean(0)
         chance = chance or float(np.median(counted))
         centre, votes = grid[counted.argmax()], float(counted.max())
     return centre, votes, chance
 
 
-def _votes(
-    signal: np.ndarray, camera: Camera, centres: np.ndarray, radius: float, blur: float, azimuth: np.ndarray
-) -> np.ndarray:
-    """Mean vote of the outline of each centre (N, 3), which lie close together."""
-    vote, framed = ballots(signal, camera, centres, radius, blur, azimuth)
-    return vote.sum(-1) / np.maximum(framed.sum(-1), 1)
-
-
 def ballots(
-    signal: np.ndarray, camera: Camera, centres: np.ndarray, radius: float, blur: float, azimuth: np.ndarray
+    signals: list[np.ndarray], camera: Camera, centres: np.ndarray, radius: float, blur: float, azimuth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vote (N, A) of every azimuth of the outlines of centres (N, 3) that lie close together; and whether in frame."""
-    typical = radius_in_pixels(camera, centres[len(centres) // 2], radius)
-    corner, part, view = _around(signal, camera, centres[len(centres) // 2], radius, 1.4, typical)
-    slope = _slopes(part, blur)
-    beside = silhouette(view, centres[len(centres) // 2], 1.25 * radius, azimuth)[0]
-    floor = (
-        2 * float(np.median(np.linalg.norm(bilinear(slope, beside[None, :, 0], beside[None, :, 1]), axis=-1))) + 1e-9
-    )
+    """Vote (S, N, A) in each signal (H, W) of every azimuth of the outlines of centres (N, 3) that lie close together;
+
+    and whether it is in frame (N, A).
+    """
+    middle = centres[len(centres) // 2]
+    window, view = _around(camera, middle, 1.4 * radius)
+    beside = silhouette(view, middle, 1.25 * radius, azimuth)[0]
     px, normal, _ = silhouette(view, centres, radius, azimuth)
-    framed = inside(camera, px + corner, 2)
-    found = bilinear(slope, px[..., 0], px[..., 1])
-    across, strength = np.abs((found * normal).sum(-1)), np.linalg.norm(found, axis=-1) + 1e-12
-    vote = framed * (across / strength) ** 2 * across / (across + floor)
-    return vote, framed
+    framed = inside(camera, px + np.array([window[1].start, window[0].start]), 2)
+    votes = []
+    for signal in signals:
+        slope = _slopes(signal[window], blur)
+        usual = np.linalg.norm(bilinear(slope, beside[None, :, 0], beside[None, :, 1]), axis=-1)
+        floor = 2 * float(np.median(usual)) + 1e-9
+        found = bilinear(slope, px[..., 0], px[..., 1])
+        right, down = found[..., 0], found[..., 1]
+        across = np.abs(right * normal[..., 0] + down * normal[..., 1])
+        strength = np.sqrt(right * right + down * down) + 1e-12
+        votes.append(framed * (across / strength) ** 2 * across / (across + floor))
+    return np.stack(votes), framed
 
 
-def _around(
-    signal: np.ndarray, camera: Camera, centre: np.ndarray, radius: float, grown: float, typical: float
-) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """Corner (x, y), pixels and camera of the part of a picture about a ball, with 15 px to spare."""
-    px = silhouette(camera, centre, grown * radius, azimuths(60))[0]
+def _around(camera: Camera, centre: np.ndarray, radius: float) -> tuple[tuple[slice, slice], Camera]:
+    """Rows and columns of the part of a picture about a sphere, with 15 px to spare, and its camera."""
+    px = silhouette(camera, centre, radius, azimuths(60))[0]
     limit = np.array([camera.width, camera.height])
     low = np.clip(np.floor(np.nanmin(px, 0)) - 15, 0, limit - 2).astype(int)
     high = np.clip(np.ceil(np.nanmax(px, 0)) + 15, low + 2, limit).astype(int)
-    return low, signal[low[1] : high[1], low[0] : high[0]], part_of(camera, low, high)
+    return (slice(low[1], high[1]), slice(low[0], high[0])), part_of(camera, low, high)
 
 
 def coverage(signals: list[np.ndarray], camera: Camera, centre: np.ndarray, radius: float) -> tuple[float, float]:
@@ -238,10 +235,9 @@ def coverage(signals: list[np.ndarray], camera: Camera, centre: np.ndarray, radi
     near = np.array([-0.8, 0.0, 0.8]) * min(1.0, size / 40)
     places = np.array([centre * size / (size + d + e) for d in shifts for e in near])
     best = 0.0
-    for signal in signals:
-        vote, framed = ballots(signal, camera, places, radius, 0.7, azimuth)
-        vote = vote.reshape(len(shifts), len(near), -1).max(1)
-        seen = framed.reshape(len(shifts), len(near), -1).all((0, 1))
-        if seen.any():
-            best = max(best, float((vote.argmax(0) == 0)[seen].mean()))
+    votes, framed = ballots(signals, camera, places, radius, 0.7, azimuth)
+    seen = framed.reshape(len(shifts), len(near), -1).all((0, 1))
+    for vote in votes if seen.any() else []:
+        first = vote.reshape(len(shifts), len(near), -1).max(1).argmax(0) == 0
+        best = max(best, float(first[seen].mean()))
     return best, 1 / len(shifts)
