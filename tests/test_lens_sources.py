@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from printed_board import BOARD, charuco_print, looking_at, photograph
+from pydantic import ValidationError
 from test_calibrate import POINTS, TRUTH, corners_of, poses_of
 
 from pipeline.camera import exif_camera as exif
@@ -19,6 +21,7 @@ from pipeline.camera.resection import refine
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.image.lens_database import distortion_samples
 from pipeline.run.errors import CaptureError
+from pipeline.run.manifest import BallFacts, CameraFacts
 from pipeline.types import Bracket, Camera, Frame, Reconstruction
 from stages import calibrate, knobs
 from tests.dng_writer import write_dng
@@ -194,6 +197,30 @@ def test_corners_of_a_raw_board(tmp_path: Path) -> None:
     off = seen.px - lens.project(camera, camera_points(pose, seen.world_m)[0])
     assert np.sqrt((off**2).mean()) < 0.08
     assert np.abs(off.mean(0)).max() < 0.03  # no half pixel, no shift of the colours
+
+
+def test_a_deep_tiff_keeps_its_corners(tmp_path: Path) -> None:
+    """16 bit, nearly black: 8 bit would leave 10 steps between black and white. Twice the brightness, same corners."""
+    camera = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1)
+    pose = looking_at(np.array([0.105, 0, 0.075]), 35, 20, 0.42)
+    light = photograph(charuco_print(BOARD), camera, pose, 2)
+    found = []
+    for number, scale in enumerate((3000, 6000)):
+        tifffile.imwrite(tmp_path / f"{number}.tif", np.repeat(np.uint16(light * scale)[..., None], 3, -1))
+        found.append(board_sightings(*board_picture(tmp_path / f"{number}.tif"), BOARD).px)
+    assert len(found[0]) == 24
+    assert np.abs(found[0] - found[1]).max() < 0.02
+
+
+# In the manifest ------------------------------------------------------------------------------------------------------
+
+
+def test_a_former_camera_stands_alone() -> None:
+    assert CameraFacts(file="camera.json").file == "camera.json"
+    with pytest.raises(ValidationError, match="a former calibration stands alone"):
+        CameraFacts(file="camera.json", calibration=["*.jpg"])
+    ball = {"name": "ball_b", "files": ["b.dng"], "camera": {"file": "camera.json"}}
+    assert BallFacts.model_validate(ball).camera is not None
 
 
 # What a set of photographs fixes --------------------------------------------------------------------------------------
