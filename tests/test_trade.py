@@ -264,6 +264,8 @@ class Toy(work.Bench):
     def _run(self, point, work_folder):
         if dict(point.changes).get("render.samples") == 4:
             return 3, "too dark"
+        if dict(point.changes).get("render.samples") == 512:
+            return -9, ""
         if dict(point.changes).get("render.samples") == 8:
             raise KeyboardInterrupt
         for name in self.keys(point):
@@ -333,6 +335,12 @@ def test_code_or_photographs_that_change_make_a_new_point(toy):
     toy.code = CODE | {"render": "other"}
     with pytest.raises(ArtifactError, match="render: the code changed while it was measured"):
         toy.measure(base)
+
+
+def test_a_point_that_was_killed_is_tried_again_next_time(toy):
+    large = Point("render.samples=512", "knob", "preview", (("render.samples", 512),))
+    assert toy.measure(large)["failed"] == "killed by signal 9"
+    assert toy.known(large) is None
 
 
 def test_interrupted_keeps_what_is_done(toy):

@@ -98,6 +98,8 @@ class Bench:
         spent = time.perf_counter() - start
         if code in (3, 6):
             row: Row = {"failed": said}
+        elif code < 0:  # by the system, as when memory is short: the others may do, and this one next time
+            return {"failed": f"killed by signal {-code}"} | said_of(point)
         elif code:
             raise error_of(code, f"{point.label}: {said}")
         else:
