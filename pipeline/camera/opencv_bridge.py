@@ -163,6 +163,12 @@ def refined_corners(
 
 def marker_corners_px(picture: np.ndarray, name: str, marker_id: int) -> tuple[np.ndarray, int]:
     """Rough corners (K, 4, 2) of every marker with this id (x right, y down the print: clockwise), and all seen."""
+    ids, quads = markers_px(picture, name)
+    return quads[ids == marker_id], len(ids)
+
+
+def markers_px(picture: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Ids (K,) and rough corners (K, 4, 2) of every marker of a dictionary."""
     import cv2
 
     small, step = shrunk(picture)
@@ -170,8 +176,7 @@ def marker_corners_px(picture: np.ndarray, name: str, marker_id: int) -> tuple[n
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     quads, ids, _ = cv2.aruco.ArucoDetector(dictionary(name), options).detectMarkers(small)
     ids = np.empty(0, int) if ids is None else np.asarray(ids).ravel()
-    chosen = [ours(quad) * step for quad, found in zip(quads, ids, strict=True) if found == marker_id]
-    return np.array(chosen).reshape(-1, 4, 2), len(ids)
+    return ids, np.array([ours(quad) * step for quad in quads]).reshape(-1, 4, 2)
 
 
 def marker_pattern(name: str, marker_id: int) -> np.ndarray:

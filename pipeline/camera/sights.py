@@ -6,12 +6,14 @@ linear radiance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera.markers import fit_marker, marker_points, tone
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_corners_px, marker_pattern
+from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_pattern, markers_px
 from pipeline.camera.sfm import Seen
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera
@@ -19,6 +21,7 @@ from pipeline.types import Camera
 FEWEST_CORNERS = 6
 ENOUGH_OF_BOARD = 0.7  # with fewer corners than this fraction the other tone curve is tried too
 CURVES = ("gamma", "log")
+Look = Callable[[str, str], tuple[np.ndarray, np.ndarray]]  # of a tone curve and a dictionary
 
 
 def eight_bit(toned: np.ndarray) -> np.ndarray:
@@ -38,13 +41,27 @@ def sighted_board(radiance: np.ndarray, board: dict[str, Any], camera: Camera) -
     return max(tries, key=lambda seen: len(seen.px))
 
 
-def sighted_marker(radiance: np.ndarray, marker: dict[str, Any], camera: Camera) -> Sightings:
+def looked_at(radiance: np.ndarray) -> Look:
+    """Ids and rough corners of the markers in a picture by tone curve and dictionary, each looked for once."""
+
+    @cache
+    def look(curve: str, dictionary: str) -> tuple[np.ndarray, np.ndarray]:
+        return markers_px(eight_bit(tone(radiance, curve)), dictionary)
+
+    return look
+
+
+def sighted_marker(radiance: np.ndarray, marker: dict[str, Any], camera: Camera, look: Look | None = None) -> Sightings:
     """The four corners of a marker in linear radiance (H, W); none when it is not seen.
+
+    ``look`` keeps what was found for the next marker of the same dictionary (`looked_at`).
 
     Raises CaptureError when it is seen twice, or when an edge cannot be followed.
     """
+    look = look or looked_at(radiance)
     for curve in CURVES:
-        quads, markers = marker_corners_px(eight_bit(tone(radiance, curve)), marker["dictionary"], marker["id"])
+        ids, all_quads = look(curve, marker["dictionary"])
+        quads, markers = all_quads[ids == marker["id"]], len(ids)
         if len(quads):
             break
     if len(quads) > 1:
@@ -62,10 +79,10 @@ def marks_in(facts: dict[str, Any], radiance: np.ndarray, camera: Camera) -> tup
     if facts.get("board"):
         sights = sighted_board(radiance, facts["board"], camera)
         return ([Seen(0, sights.world_m, sights.px)] if len(sights.px) >= FEWEST_CORNERS else []), []
-    found, notes = [], []
+    found, notes, look = [], [], looked_at(radiance)
     for number, marker in enumerate(facts["marker"]):
         try:
-            sights = sighted_marker(radiance, marker, camera)
+            sights = sighted_marker(radiance, marker, camera, look)
         except CaptureError as error:
             notes.append(str(error))
             continue
