@@ -83,7 +83,8 @@ class Session:
         return found
 
     def _measure(self, point: Point, later: Sequence[Point]) -> Row:
-        guess = self.bench.expected(point, self.seconds())
+        known = self.seconds()
+        guess = self.bench.expected(point, known) if known else 0.0
         start = time.perf_counter()
         fresh = point.kind == "repeat" or (point.kind == "base" and not self.reuse)
         row = self.bench.measure(point, later, fresh)
