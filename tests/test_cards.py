@@ -12,6 +12,7 @@ from pipeline.light.environment import irradiance, resize_environment
 from pipeline.probes import cards, clipped
 from pipeline.probes.grey_ball import sphere_normals
 from pipeline.probes.observation import Shots
+from pipeline.run.manifest import ReferenceFacts
 from pipeline.types import Raster
 
 LAMP = flux_scene.Lamp(flux_scene.from_angles(40, 110), np.ones(3), np.radians(0.5))
@@ -162,3 +163,12 @@ def test_a_card_without_reflectance_is_no_evidence_and_says_so(light):
     found = cards.cards_of(shots(lit(np.ones(3)), card(corners, reflectance=None)))
     assert not len(found.normal)
     assert "reflectance" in found.said["grey"]
+
+
+def test_a_size_is_for_a_card_with_four_corners():
+    facts = {"name": "grey", "kind": "grey_card", "size_mm": (210, 297), "reflectance": (0.18, 0.18, 0.18)}
+    four, three = ([{"view": "plate", "corners_px": [(0, 0), (9, 0), (9, 9), (0, 9)][:count]}] for count in (4, 3))
+    assert ReferenceFacts.model_validate({**facts, "seen": four}).on_plane is None
+    for wrong in ({"seen": three}, {"seen": four, "kind": "grey_ball"}):
+        with pytest.raises(ValueError, match="size_mm"):
+            ReferenceFacts.model_validate({**facts, **wrong})
