@@ -135,9 +135,9 @@ class Report(Params):
 
 
 KNOBS: dict[str, type[Params]] = {
-    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sfm": Sfm, "calibrate": Calibrate, "pose": Pose,
-    "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance, "render": Render,
-    "composite": Composite, "evaluate": Evaluate, "report": Report,
+    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sfm": Sfm,
+    "calibrate": Calibrate, "pose": Pose, "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance,
+    "render": Render, "composite": Composite, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip
 
 # What each preset changes from the defaults above.
