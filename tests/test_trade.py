@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import shutil
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -337,6 +338,75 @@ def test_code_or_photographs_that_change_make_a_new_point(toy):
         toy.measure(base)
 
 
+class Priced(Toy):
+    """A bench on which stages cost, and pictures err, by formulas."""
+
+    def _run(self, point, work_folder):
+        params = self.settle(point).params
+        for name in self.keys(point):
+            cpu = {"probe": params["probe"]["width"] / 100, "render": float(params["render"]["samples"])}.get(name, 0.5)
+            record = {"seconds": cpu / 2, "cpu_seconds": cpu, "peak_mb": 100.0, "numbers": {}, "code": "same"}
+            (work_folder / name).mkdir(parents=True, exist_ok=True)
+            (work_folder / name / "record.json").write_text(json.dumps(record))
+        error = (1 / params["render"]["samples"] + 1 / params["probe"]["width"]) ** 0.5
+        (work_folder / "composite" / "composite.exr").write_text(str(error))
+        return 0, ""
+
+
+def test_the_whole_of_a_trade_on_made_up_costs(toy, tmp_path):
+    """Knobs alone, both designs, the front and the pages; presets and repeats are told apart."""
+    bench = Priced(graph(), tmp_path, toy.settle, error_of_a_text, "source", {}, CODE)
+    session = trade.Session(bench, lambda line: None)
+
+    def settle(quality: str, switches: list[str]) -> Settings:
+        return toy.settle(Point("", "", quality))
+
+    knobs = ["probe.width", "render.samples", "composite.half"]
+    asked = trade.Asked(tmp_path, settle, graph(), KNOBS, knobs=knobs, presets=False)
+    trade.explore(asked, session, Point("preview", "base", "preview"), "truth")
+    kinds = [r["kind"] for r in session.rows]
+    assert kinds[:3] == ["repeat", "repeat", "base"]
+    assert kinds.count("knob") == 3 + 5 + 1
+    combined = {r["label"] for r in session.rows if r["kind"] == "design"}
+    assert combined == {"probe.width=256 render.samples=16", "probe.width=2048 render.samples=512"}
+    assert [r["label"] for r in session.rows if r["kind"] == "knob" and r["cpu_seconds"] > 100] == [
+        "render.samples=128", "render.samples=512",
+    ]  # fmt: skip
+    told = {**about(), "noise": front.noise(session.rows)}
+    record = json.loads(page.write(tmp_path, session.rows, told)[0].read_text())
+    for label, guess in record["predicted"].items():
+        measured = next(r for r in session.rows if r["label"] == label)
+        assert measured["cpu_seconds"] == pytest.approx(guess["cpu_seconds"])  # its stages are independent
+        assert measured["errors"]["changed_rel_err"] == pytest.approx(guess["changed_rel_err"])
+
+
+def error_of_a_text(build) -> dict:
+    return {"changed_rel_err": float((build / "composite" / "composite.exr").read_text())}
+
+
+def test_the_base_is_charged_where_a_shared_stage_had_to_run_again(toy):
+    base = Point("preview", "base", "preview")
+    row_ = toy.measure(base)
+    row_["stages"]["merge"]["cpu_seconds"] = 7.0
+    toy.enter(base, row_)
+    shutil.rmtree(toy.root / "store")
+    again = toy.measure(Point("w", "knob", "preview", (("probe.width", 512),)))
+    assert again["linked"] == []
+    assert again["stages"]["merge"]["cpu_seconds"] == 7.0
+    assert again["stages"]["probe"]["cpu_seconds"] == 2.0
+
+
+def test_a_point_that_compiled_is_run_twice(toy, monkeypatch):
+    found = iter([set(), {"kernel"}, {"kernel"}, {"kernel"}])
+    monkeypatch.setattr(work, "kernels", lambda: next(found))
+    runs = []
+    once = toy._run
+    toy._run = lambda point, folder: (runs.append(point.label), once(point, folder))[1]
+    toy.measure(Point("cold", "base", "preview"))
+    toy.measure(Point("warm", "knob", "preview", (("probe.width", 512),)))
+    assert runs == ["cold", "cold", "warm"]
+
+
 def test_a_point_that_was_killed_is_tried_again_next_time(toy):
     large = Point("render.samples=512", "knob", "preview", (("render.samples", 512),))
     assert toy.measure(large)["failed"] == "killed by signal 9"
@@ -367,7 +437,7 @@ def test_two_points_of_the_desk(desk_build, tmp_path):
     for key in ("object_rel_err", "shadow_change_err"):
         assert base["errors"][key] == pytest.approx(built[key], abs=1e-12)  # the same figures as insitu evaluate
         assert half["errors"][key] == pytest.approx(built[key], rel=0.02)  # half floats round by 2^-12 of the factor
-    for name in base["stages"].keys() - {"ingest"}:  # which reads outside the build, so it is asked every time
+    for name in base["stages"].keys() - {"ingest"}:  # it reads outside the build, so it is asked every time
         taken = json.loads((desk_build / name / "record.json").read_text())
         assert base["stages"][name] == {key: taken[key] for key in ("seconds", "cpu_seconds", "peak_mb")}, name
     for one in (base, half):

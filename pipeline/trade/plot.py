@@ -12,7 +12,7 @@ from pipeline.trade.work import Row
 WIDTH, HEIGHT = 760, 470
 LEFT, RIGHT, TOP, BOTTOM = 70, 20, 20, 50
 COLOURS = {"base": "#c23b32", "preset": "#b4541a", "knob": "#4c78a8", "design": "#54a24b"}
-STEPS = (1, 2, 5)
+STEPS, FINE_STEPS = (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)
 
 
 def pareto_svg(rows: Sequence[Row], figure: str, name: str) -> str:
@@ -49,8 +49,9 @@ def pareto_svg(rows: Sequence[Row], figure: str, name: str) -> str:
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{COLOURS[row["kind"]]}" fill-opacity="0.75">'
             f"<title>{escape(row['label'])}</title></circle>"
         )
-        if named:
-            parts.append(f'<text x="{x + 9:.1f}" y="{y - 6:.1f}" font-weight="bold">{escape(row["label"])}</text>')
+        if named or row["front"][figure]:
+            weight = "bold" if named else "normal"
+            parts.append(f'<text x="{x + 7:.1f}" y="{y - 6:.1f}" font-weight="{weight}">{escape(row["label"])}</text>')
     for number, (kind, words) in enumerate(
         {"base": "base", "preset": "preset", "knob": "one knob changed", "design": "combination"}.items()
     ):
@@ -74,7 +75,8 @@ class Axis:
         return self.start + share * (self.end - self.start)
 
     def ticks(self) -> list[float]:
-        """Round values within the axis: 1, 2, 5 of every decade."""
+        """Round values within the axis: 1, 2, 5 of every decade, more of them where there is but one."""
+        steps = STEPS if self.high - self.low > 1 else FINE_STEPS
         decades = range(math.floor(self.low), math.ceil(self.high) + 1)
-        values = [step * 10.0**decade for decade in decades for step in STEPS]
+        values = [step * 10.0**decade for decade in decades for step in steps]
         return [value for value in values if self.low <= math.log10(value) <= self.high]

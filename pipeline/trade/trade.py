@@ -69,6 +69,8 @@ class Session:
             else:
                 note = "known"
             self.rows.append(row)
+            if row["kind"] == "base" and "failed" not in row:
+                self.bench.enter(point, row)
             left = self.left(later)
             ending = f", about {left} left{more}" if later and left else more if not later else ""
             self.say(f"[{number}/{len(points)}] {told(row)}, {note}{ending}")
