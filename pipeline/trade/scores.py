@@ -41,13 +41,13 @@ def scores(
 
 def changed_error(composite_box: np.ndarray, plate_box: np.ndarray, ref: metrics.Reference) -> float | None:
     """``changed_rel_err`` of 5x5 means (H, W, 3); None when nothing truly changes."""
-    ours = composite_box.astype(float) - plate_box
+    ours = composite_box - plate_box  # as the truth's change is taken, so that a picture has no error against itself
     edge = metrics.relative(ref.change_box, ref.truth_box - ref.change_box) > metrics.FAINT
     changed = ref.covered | edge | (ours != 0).any(-1)
     total = float((ref.change_box[changed].astype(float) ** 2).sum())
     if not total:
         return None
-    return float(np.sqrt(((ours - ref.change_box)[changed] ** 2).sum() / total))
+    return float(np.sqrt(((ours - ref.change_box)[changed].astype(float) ** 2).sum() / total))
 
 
 def pictures_of(build: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
