@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command import DESK, command
+from command import DESK, SAMPLES, command
 
 from pipeline.capture.photographs import files_of, read_all
 from pipeline.capture.roles import Proposal, propose
@@ -20,6 +20,15 @@ def desk_build(tmp_path_factory) -> Path:
     done = command("run", DESK, "--out", out, "--quality", "draft")
     assert done.returncode == 0, done.stderr
     (out.parent / "stdout").write_text(done.stdout)
+    return out
+
+
+@pytest.fixture(scope="session")
+def counter_build(tmp_path_factory) -> Path:
+    """Build folder of ``insitu run sample_captures/counter --quality draft``; read it, never write into it."""
+    out = tmp_path_factory.mktemp("counter") / "build"
+    done = command("run", SAMPLES / "counter", "--out", out, "--quality", "draft")
+    assert done.returncode == 0, done.stderr
     return out
 
 

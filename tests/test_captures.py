@@ -74,9 +74,8 @@ def value(out: Path, artifact: Artifact) -> Any:
 
 
 @pytest.mark.parametrize("capture", CAPTURES, ids=lambda path: path.name)
-def test_draft_meets_its_bounds(capture, desk_build, tmp_path):
-    out = desk_build if capture == DESK else run(capture, tmp_path / "out", "draft")
-    check_bounds(capture, out, "draft")
+def test_draft_meets_its_bounds(capture, request):
+    check_bounds(capture, request.getfixturevalue(f"{capture.name}_build"), "draft")
 
 
 @pytest.mark.slow
