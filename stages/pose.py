@@ -80,9 +80,12 @@ def compute(
     orders = {name: order_of(facts, name, balls) for name in ("plate", *balls)}
     cameras = {name: view_cameras.get(name, camera) for name in orders}
     check_sizes(photographs, cameras)
+    tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
     several = len(facts.get("marker") or []) > 1
-    mapped = [name for name, order in orders.items() if order["route"] == "marker" and several]
+    settled = tripod if orders["plate"]["route"] == "colmap" else []  # all photographs say whether these stayed
+    mapped = [n for n, order in orders.items() if order["route"] == "marker" and several and n not in settled]
     looked = [name for name, order in orders.items() if order["route"] in ("charuco", "marker") and name not in mapped]
+    looked = [name for name in looked if name not in settled]
     with ThreadPoolExecutor(2) as pool:  # OpenCV releases the GIL
         sights = dict(
             zip(looked, pool.map(lambda n: sight(facts, n, orders[n], photographs[n], cameras[n]), looked), strict=True)
@@ -90,7 +93,6 @@ def compute(
     warnings: list[str] = []
     estimates: dict[str, Estimate] = {}
     views: dict[str, View] = {}
-    tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
     asked = [name for name, order in orders.items() if order["route"] == "colmap"]
     extra: dict[str, Any] = {}
     cloud = Reconstruction()

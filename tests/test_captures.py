@@ -139,7 +139,9 @@ def test_order_and_repetition_of_frames_do_not_matter(desk_build, tmp_path):
 
 
 def draft(stage: str) -> Any:
-    return knobs.KNOBS[stage].model_validate(knobs.PRESETS["draft"].get(stage, {}))
+    """The knobs of desk_build: the preset's, and those that desk's scene.toml sets."""
+    scene = tomllib.loads((DESK / "scene.toml").read_text())
+    return knobs.KNOBS[stage].model_validate(knobs.PRESETS["draft"].get(stage, {}) | scene.get(stage, {}))
 
 
 def rendered(out: Path, **changes: Any) -> Raster:

@@ -175,7 +175,7 @@ def capture_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]
         },
     )
     if scene.board is not None:
-        yield "[board]", scene.board.model_dump()
+        yield "[board]", scene.board.model_dump(exclude_none=True)
     for marker in scene.marker:
         yield "[[marker]]", {key: getattr(marker, key) for key in ("dictionary", "id", "side_m")}
     if scene.view:
