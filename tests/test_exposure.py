@@ -286,8 +286,8 @@ def test_corridor_was_shot_in_thirds_whatever_exif_says():
         weight = 1 / np.sqrt(1 + (miss / np.median(miss)) ** 2)
     steps = solution[len(knots) :]
     off = np.abs(steps - 1 / 3)
-    # Measured 0.317 to 0.370 (EXIF: 0.206 to 0.415). The bound was set after that: noise of the darkest frame's codes, not
-    # derived; the mean is 1/3 because the curve's power is free, so what is shown is that the steps are even.
+    # Measured 0.317 to 0.370 (EXIF: 0.206 to 0.415). The bound was set after that and is not derived; the mean is 1/3
+    # because the curve's power is free, so what is shown is that the steps are even.
     assert off.max() < 0.04
     assert np.median(off) < 0.008
     assert np.abs(np.corrcoef(steps, stated)[0, 1]) < 0.5  # what EXIF makes of them is rounding

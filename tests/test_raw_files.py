@@ -136,7 +136,7 @@ CODINGS = {
 
 @pytest.mark.parametrize("coding", CODINGS)
 def test_no_damaged_header_gives_another_picture_in_silence(tmp_path, coding):
-    """60 headers with 6 random bytes each: refused in one line, or the same samples (0 of 6000 escaped in a long run)."""
+    """60 headers with 6 random bytes each: refused in one line, or the same samples (0 of 6000 escaped, long run)."""
     rng = np.random.default_rng(list(CODINGS).index(coding))
     samples = rng.integers(0, 15000, (60, 80)).astype(np.uint16)
     path = write_dng(tmp_path / "a.dng", samples, **CODINGS[coding])
