@@ -28,6 +28,7 @@ from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_ve
 from pipeline.camera.board_pictures import board_picture
 from pipeline.camera.exif_camera import exif_camera
 from pipeline.camera.former_camera import reused
+from pipeline.camera.given_camera import given_camera
 from pipeline.camera.lens import project, unproject
 from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration
 from pipeline.camera.resection import minimise, refine, residuals_and_jacobian, robust_scale
@@ -35,7 +36,7 @@ from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
 from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
 from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
-from pipeline.run.errors import CaptureError, ManifestError, NumericalError
+from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result
 from stages import knobs
@@ -167,22 +168,6 @@ def calibrated(
     chosen, errors, evidence = climb(start, poses, photos)
     judged = judge(chosen, photos, errors, evidence, warnings, params)
     return replace(judged, outputs={"camera": of_optics(judged.outputs["camera"], frame)})
-
-
-def given_camera(given: dict[str, Any], where: str = "camera") -> Camera:
-    """The manifest's numbers as a camera. Raises ManifestError with every problem."""
-    known = {"width", "height", "fx", "fy", "cx", "cy", "distortion"}
-    problems = [f"{where}.given.{key}: unknown key" for key in sorted(set(given) - known)]
-    problems += [f"{where}.given.{key}: missing; it is required" for key in sorted(known - set(given) - {"distortion"})]
-    distortion = np.ravel(given.get("distortion", []))
-    if len(distortion) > 5:
-        problems.append(f"{where}.given.distortion: has {len(distortion)} terms; expected at most 5 (k1 k2 p1 p2 k3)")
-    if problems:
-        raise ManifestError(*problems)
-    numbers = {key: given[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    if min(numbers["width"], numbers["height"], numbers["fx"], numbers["fy"]) <= 0:
-        raise ManifestError(f"{where}.given: is {numbers}; expected positive sizes and focal lengths")
-    return Camera(**numbers, distortion=np.pad(distortion, (0, 5 - len(distortion))), source="given")
 
 
 def sight(

@@ -133,14 +133,7 @@ def _board_photos(
     photos: list[dict[str, str]] = []
     taken: dict[str, list[Frame]] = {}
     for view, (key, camera) in cameras.items():
-        files, found = resolve_files(camera.calibration, root, f"{manifest}: {key}.calibration")
-        problems.extend(found)
-        frames = []
-        for file in files:
-            try:
-                frames.append(read_frame(file, file.relative_to(root).as_posix()))
-            except CaptureError as error:
-                flaws.append(str(error))
+        frames = _single_frames(camera.calibration, root, f"{manifest}: {key}.calibration", problems, flaws)
         flaws.extend(lens_strangers(frames, "board photographs"))
         taken[view] = frames
         photos += [{"file": frame.file, "sha256": frame.sha256, "view": view} for frame in frames]
@@ -151,7 +144,14 @@ def _view_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list
     """The further photographs; exposure does not matter for them."""
     if facts.views is None:
         return []
-    files, found = resolve_files(facts.views.files, root, f"{manifest}: views.files")
+    frames = _single_frames(facts.views.files, root, f"{manifest}: views.files", problems, flaws)
+    flaws.extend(lens_strangers(frames, "further views"))
+    return frames
+
+
+def _single_frames(patterns: list[str], root: Path, where: str, problems: list[str], flaws: list[str]) -> list[Frame]:
+    """Photographs that are no brackets, those that can be used; what is wrong with the others is said."""
+    files, found = resolve_files(patterns, root, where)
     problems.extend(found)
     frames = []
     for file in files:
@@ -159,7 +159,6 @@ def _view_photos(facts: CaptureFacts, root: Path, manifest: Path, problems: list
             frames.append(read_frame(file, file.relative_to(root).as_posix()))
         except CaptureError as error:
             flaws.append(str(error))
-    flaws.extend(lens_strangers(frames, "further views"))
     return frames
 
 

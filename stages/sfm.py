@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.colmap_bridge import reconstruct
+from pipeline.camera.given_camera import given_camera
 from pipeline.camera.markers import grey, tone
 from pipeline.camera.opencv_bridge import read_grey
 from pipeline.camera.sfm import camera_start
@@ -88,8 +89,7 @@ def bodies_of(
     """
     own = {ball["name"] for ball in facts["ball"] if ball.get("camera")}
     plate = brackets["plate"].frames[0]
-    given = facts["camera"].get("given") or facts["camera"].get("former")
-    cameras = [_given(given) if given else camera_start(_hinted(plate, view_photos))]
+    cameras = [_start(facts["camera"], plate, view_photos)]
     bodies = {name: 0 for name, b in brackets.items() if name not in own and b.role in ("plate", "ball")}
     other = bool(facts["views"]["own_camera"])
     size = (plate.width, plate.height) if not other else (view_photos[0].width, view_photos[0].height)
@@ -111,10 +111,13 @@ def _hinted(plate: Frame, view_photos: list[Frame]) -> Frame:
     return plate if plate.focal_35mm > 0 else plate.model_copy(update={"focal_35mm": hint})
 
 
-def _given(given: dict[str, Any]) -> Camera:
-    numbers = {key: given[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    distortion = np.ravel(given.get("distortion", []))
-    return Camera(**numbers, distortion=np.pad(distortion, (0, 5 - len(distortion))), source="given")
+def _start(stated: dict[str, Any], plate: Frame, view_photos: list[Frame]) -> Camera:
+    """The plate's lens as known so far: stated or of a former build, which are held, else what EXIF makes of it."""
+    if stated.get("given"):
+        return given_camera(stated["given"])
+    if stated.get("former"):
+        return Camera.model_validate({**stated["former"], "source": "given"})
+    return camera_start(_hinted(plate, view_photos))
 
 
 def _seen(photograph: Raster) -> np.ndarray:

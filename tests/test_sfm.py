@@ -13,7 +13,7 @@ from pipeline.camera.rigid import difference
 from pipeline.camera.sfm import Seen, camera_start, oriented
 from pipeline.run import artifacts as A
 from pipeline.run import formats
-from pipeline.run.errors import CaptureError, NumericalError
+from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.types import Bracket, Camera, Frame, Reconstruction
 from stages import knobs, sfm
 from stages.order import graph
@@ -46,6 +46,13 @@ def test_photographs_of_another_size_ask_for_a_camera_of_their_own() -> None:
     cameras, bodies = sfm.bodies_of(facts, brackets, [frame("v.jpg", 64, 48)])
     assert [camera.width for camera in cameras] == [96, 64]
     assert bodies == {"plate": 0, "v.jpg": 1}
+
+
+def test_a_given_lens_is_checked_before_it_is_used() -> None:
+    facts = {"ball": [], "camera": {"given": {"width": 96, "height": 72}}, "views": {"own_camera": False}}
+    brackets = {"plate": Bracket(name="plate", role="plate", frames=[frame("p.dng")])}
+    with pytest.raises(ManifestError, match=r"camera\.given\.fx: missing"):
+        sfm.bodies_of(facts, brackets, [frame("v.jpg")])
 
 
 def test_nothing_is_done_without_further_views() -> None:

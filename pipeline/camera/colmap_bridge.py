@@ -15,7 +15,6 @@ from pipeline.types import Camera, Reconstruction
 
 LARGEST_SIDE_PX = 2400  # features are found on pictures at most this large
 FEATURES = 6000  # of a photograph
-MIN_TRACK = 2
 FEWEST_POINTS = 30
 FREE_MODEL, KNOWN_MODEL = "SIMPLE_RADIAL", "FULL_OPENCV"  # the latter is Brown's with its denominator 1
 

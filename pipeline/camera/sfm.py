@@ -24,7 +24,7 @@ FILM_MM = 36.0  # width that "35 mm equivalent" focal lengths mean; makers also 
 USUAL_FOCAL = 1.2  # of the long side, without any hint
 FOCAL_SIGMA, CENTRE_SIGMA = 0.25, 0.02  # of the start; the principal point in units of the long side
 NEEDED_DEVIANCE = 9.0  # per parameter that buys a term of the lens: three standard errors
-CALIBRATING_POINTS, ORIENTING_POINTS = 5000, 5000  # more cost time and add little
+MOST_POINTS = 5000  # of the cloud that are adjusted: more cost time and add little
 CELLS = 8  # of the frame along each side, for keeping points that reach everywhere
 EDGE_BIAS_PX = 0.05  # of a marker's side, in every view alike: blur, clipped paper, tone curve
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("p1", "p2"))
@@ -49,8 +49,8 @@ def camera_start(frame: Frame) -> Camera:
     )  # fmt: skip
 
 
-def bundle_of(reconstruction: Reconstruction, cameras: list[Camera], most: int) -> Bundle:
-    """The cloud and its sightings, for adjusting, with these lenses; at most so many points.
+def bundle_of(reconstruction: Reconstruction, cameras: list[Camera]) -> Bundle:
+    """The cloud and its sightings, for adjusting, with these lenses; at most `MOST_POINTS` points.
 
     Long tracks are kept before short ones, and those that reach into parts of the frame that few do: distortion shows
     at the corners.
@@ -61,7 +61,7 @@ def bundle_of(reconstruction: Reconstruction, cameras: list[Camera], most: int) 
     cell = place[:, 1] * CELLS + place[:, 0]
     rare = 1 / np.maximum(np.bincount(cell, minlength=CELLS**2), 1)[cell]
     worth = np.bincount(reconstruction.seen_point, weights=rare, minlength=counted)
-    kept = np.sort(np.argsort(-worth, kind="stable")[:most])
+    kept = np.sort(np.argsort(-worth, kind="stable")[:MOST_POINTS])
     number = np.full(counted, -1)
     number[kept] = np.arange(len(kept))
     mine = number[reconstruction.seen_point] >= 0
@@ -94,7 +94,7 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
     prior = np.array([FOCAL_SIGMA * long] * 2 + [CENTRE_SIGMA * long] * 2 + [np.inf] * 5)
     priors = [prior if n == body else np.full(9, np.inf) for n in range(len(reconstruction.cameras))]
 
-    bundle = bundle_of(reconstruction, reconstruction.cameras, CALIBRATING_POINTS)
+    bundle = bundle_of(reconstruction, reconstruction.cameras)
 
     def fit(terms: tuple[str, ...], start: Bundle, like: Adjusted | None) -> Adjusted:
         columns = free_columns(terms, True)
@@ -155,7 +155,7 @@ def oriented(
         )
     markers = [marker for marker, where in placed.items() if where is not None]
     matrix, scale = umeyama(*_matched(placed[0]), scale=True)
-    bundle = bundle_of(reconstruction, cameras, ORIENTING_POINTS)
+    bundle = bundle_of(reconstruction, cameras)
     poses = [_moved(matrix, scale, pose) for pose in bundle.poses]
     places = [np.eye(4)]
     for marker in markers[1:]:
