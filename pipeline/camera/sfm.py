@@ -151,7 +151,7 @@ def oriented(
         count = len(sights.get(0, []))
         raise NumericalError(
             f"sfm: the first marker is seen in {count} of the {len(at)} oriented photographs, needed two from places "
-            "that differ, as it brings the cloud to metres; check its dictionary and id, or photograph it from more sides"
+            "that differ, to bring the cloud to metres; check its dictionary and id, or photograph it more often"
         )
     markers = [marker for marker, where in placed.items() if where is not None]
     matrix, scale = umeyama(*_matched(placed[0]), scale=True)
