@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from printed_board import BOARD, MARKER, charuco_print, looking_at, marker_print, photograph
 
+from pipeline.camera.estimates import points_estimate, view_of
 from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.conventions import WORLD_FROM_BOARD, invert_rigid
@@ -342,11 +343,12 @@ def test_surveyed_points_count_by_their_own_uncertainty() -> None:
     weighted, plain = [], []
     for _ in range(80):
         entry, truth = surveyed(rng, sigma_m, offset)
-        view = pose.view_of(pose.points_estimate(entry, CAMERA, PARAMS))
+        view = view_of(points_estimate(entry, CAMERA, PARAMS.corner_sigma_px))
         _, position_m, mahalanobis = error_of(view, truth)
         weighted.append((position_m, mahalanobis))
         bare = [{key: point[key] for key in ("world_m", "px")} for point in entry["points"]]
-        plain.append(error_of(pose.view_of(pose.points_estimate({**entry, "points": bare}, CAMERA, PARAMS)), truth)[1])
+        unweighted = points_estimate({**entry, "points": bare}, CAMERA, PARAMS.corner_sigma_px)
+        plain.append(error_of(view_of(unweighted), truth)[1])
     position_m, mahalanobis = np.array(weighted).T
     inside = float(np.mean(mahalanobis <= 12.59))
     assert inside >= 0.89  # 0.95 - 2.5 standard errors of 80

@@ -9,6 +9,7 @@ import pytest
 from ball_sights import BALL, CAMERA, POSES, RADIUS, ROOM
 from mirror_scene import Place, photograph
 
+from pipeline.camera.estimates import Estimate, refuse_ambiguous, view_of
 from pipeline.camera.lens import project
 from pipeline.camera.markers import marker_points
 from pipeline.camera.opencv_bridge import Sightings
@@ -34,17 +35,17 @@ def ball() -> Raster:
     return Raster({**parts, "mask": np.zeros(picture.shape[:2], np.uint32)}, "acescg")
 
 
-def ambiguous(lift: float = 0.0) -> pose.Estimate:
+def ambiguous(lift: float = 0.0) -> Estimate:
     """The estimate from a marker at the origin, its better and its worse pose exchanged; ``lift`` moves the plane."""
     points = marker_points(SIDE_M)
     px = project(SMALL, camera_points(TRUTH, points + np.array([0, lift, 0]))[0])
     best, second, ambiguity = resect_plane(SMALL, points, px, SIGMA_PX)
     assert second is not None
     assert ambiguity < PARAMS.min_ambiguity
-    return pose.Estimate("marker", Sightings(points, px, np.arange(4), 1), second, best, ambiguity)
+    return Estimate("marker", Sightings(points, px, np.arange(4), 1), second, best, ambiguity)
 
 
-def decided(estimate: pose.Estimate, picture: Raster, **changes) -> pose.Estimate:
+def decided(estimate: Estimate, picture: Raster, **changes) -> Estimate:
     facts = {"ball": [{"name": "ball_a", "tripod": False}], "probe": {"diameter_m": 2 * RADIUS, **changes}}
     return pose.by_ball(facts, "ball_a", estimate, {"ball_a": picture}, {"ball_a": SMALL}, PARAMS)
 
@@ -54,10 +55,10 @@ def test_the_ball_decides(ball: Raster) -> None:
     found = decided(wrong, ball)
     assert found.decided == "ball"
     assert found.ambiguity > PARAMS.min_ambiguity
-    pose.refuse_ambiguous(found, PARAMS)
+    refuse_ambiguous(found, PARAMS.min_ambiguity)
     turned = difference(found.best.world_from_camera, TRUTH)[:3]
     assert np.linalg.norm(turned) < 3 * np.sqrt(np.trace(found.best.covariance[:3, :3]))
-    views = [pose.view_of(replace(wrong, best=way)) for way in (found.best, found.second)]
+    views = [view_of(replace(wrong, best=way)) for way in (found.best, found.second)]
     chi2 = standing_chi2("ball_a", ball, None, SMALL, views, RADIUS)
     assert chi2 is not None
     assert chi2[0] < 10.8 < chi2[1]  # 99.9 % of one number
@@ -70,4 +71,4 @@ def test_without_a_ball_on_the_plane_it_stays_refused(ball: Raster) -> None:
     for found in cases:
         assert not found.decided
         with pytest.raises(NumericalError, match="two poses explain"):
-            pose.refuse_ambiguous(found, PARAMS)
+            refuse_ambiguous(found, PARAMS.min_ambiguity)
