@@ -95,7 +95,7 @@ def test_singles_leave_the_base_out():
     base = {"render": {"samples": 48}, "composite": {"kind": "auto"}}
     found = points.singles(base, "preview", ["render.samples", "composite.kind"])
     assert [p.label for p in found] == [
-        *(f"render.samples={n}" for n in (4, 8, 16, 128, 512)), "composite.kind=additive", "composite.kind=ratio",
+        *(f"render.samples={n}" for n in (2, 4, 8, 16, 128, 512)), "composite.kind=additive", "composite.kind=ratio",
     ]  # fmt: skip
     assert found[-1].switches == ["composite.kind=ratio"]
     assert Point("", "", "", (("render.denoise", False),)).switches == ["render.denoise=false"]

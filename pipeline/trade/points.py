@@ -24,7 +24,7 @@ LADDERS: dict[str, tuple[Any, ...]] = {
     "plane.extent": (4.0, 8.0, 16.0),
     "reflectance.model": ("uniform", "textured"),
     "reflectance.texture_px": (256, 512, 1024, 2048),
-    "render.samples": (4, 8, 16, 48, 128, 512),
+    "render.samples": (2, 4, 8, 16, 48, 128, 512),
     "render.depth": (2, 3, 4, 6, 10),
     "render.threshold": (0.05, 0.02, 0.008, 0.004, 0.001, 0.0),
     "render.denoise": (False, True),
