@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from command import DESK, SAMPLES, command
+from extreme_cases import pytest_addoption, pytest_collection_modifyitems, pytest_sessionfinish, saw  # noqa: F401
 
 from pipeline.capture.photographs import files_of, read_all
 from pipeline.capture.roles import Proposal, propose
