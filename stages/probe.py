@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, smooth
-from pipeline.light.environment import AXES, AXIS_NAMES, irradiance
+from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import clipped, combine, filling, levelling
 from pipeline.probes.kinds import KINDS
@@ -84,6 +84,7 @@ def compute(
         },
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
+        | {SCALE_SIGMA: " ".join(f"{sigma:.6g}" for sigma in np.broadcast_to(shared, 3))}
         | near_field.places(centre if near.target is None else near.target, centre),
     )
     coefficients = sh9_of_environment(rgb)

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.conventions import ACESCG, invert_rigid, transform_points
-from pipeline.image.colour import Space, luminance
+from pipeline.image.colour import luminance
 from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
@@ -26,11 +25,10 @@ from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
 from pipeline.transport.caustics import Film
 from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
-from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.passes import Halves, Interrupted
+from pipeline.transport.placing import place_objects
 from pipeline.transport.region import BLUR, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
-from pipeline.transport.surfaces import object_shape
 from pipeline.transport.trace import LensRays, Rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
@@ -40,46 +38,6 @@ BLURRED = 1 + 4 * BLUR**2  # interpolation errs by an eighth of second differenc
 STATISTICS_PX = 1 << 20  # pixels of the plate from which its median noise and its exposure are taken
 WORTH_A_RAY = 0.15  # of the irradiance: a weaker light is sampled with the sky, by its brightness
 Outcome = tuple[Raster, dict[str, Any], list[str]]  # layers, numbers, warnings
-
-
-def world_from_object(wish: dict[str, Any], plane: Plane) -> np.ndarray:
-    """(4, 4) from the object file's frame (+Y up) to the world: scale, yaw about +Y, then its place on the plane."""
-    yaw = np.radians(wish["yaw_deg"])
-    x, z = wish["position_m"]
-    rotation = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-    height = (plane.offset_m - plane.normal[0] * x - plane.normal[2] * z) / plane.normal[1]
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation * wish["scale"]
-    matrix[:3, 3] = [x, height + wish["lift_m"], z]
-    return matrix
-
-
-def place_objects(
-    wishes: dict[str, Any], plane: Plane, white: float, materials: str = "conserving"
-) -> tuple[dict[str, Any], list[str]]:
-    """Mitsuba shapes of every wished object, and warnings.
-
-    ``white``: radiance that an emission of 1 stands for; ``materials``: the knob.
-    """
-    mi = use_mitsuba()
-    shapes, warnings = {}, []
-    for wish in wishes["object"]:
-        meshes, notes = load_meshes(Path(wish["path"]))
-        warnings += notes
-        for index, mesh in enumerate(meshes):
-            material: Material = mesh.material
-            space: Space = "linear_rec709"
-            if wish["material"]:
-                given = dict(wish["material"])
-                space = given.pop("space")
-                material = Material(**given)
-            name = f"{wish['name']}_{index}"
-            placed = world_from_object(wish, plane)
-            shapes[name], notes = object_shape(
-                mi, name, mesh, placed, material, space, white, materials == "conserving"
-            )
-            warnings += notes
-    return shapes, warnings
 
 
 def tell(what: str) -> Callable[[float], None]:
@@ -260,7 +218,8 @@ def by_group(canvases: dict[str, Canvas]) -> Outcome:
         if total is None:
             total = layers
         else:
-            summed = {n: v if n in shared else v + layers[n] for n, v in total.channels.items()}
+            joined = {n: np.hypot if n.startswith("noise.") else np.add for n in total.channels}
+            summed = {n: v if n in shared else joined[n](v, layers[n]) for n, v in total.channels.items()}
             total = Raster(summed, ACESCG)
     assert total is not None
     return Raster(total.channels | channels, ACESCG, {"insitu:groups": ",".join(canvases)}), numbers, warnings
@@ -273,7 +232,8 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
         for layer in ("obj", "with", "without", "lost", "gained", "variance", "objvariance")
         for c in "RGB"
     ]
-    return Raster({name: np.zeros(shape, np.float32) for name in [*names, "obj.A", "ground", "influence"]}, ACESCG)
+    names += ["obj.A", "ground", "noise.change", "noise.obj", "influence"]
+    return Raster({name: np.zeros(shape, np.float32) for name in names}, ACESCG)
 
 
 def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
@@ -291,6 +251,7 @@ def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
     }
     channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(rgb, layer).items()}
     channels |= {"obj.A": images["alpha"], "ground": images["ground"]}
+    channels |= {"noise.change": images["change_noise"] * canvas.part.weight, "noise.obj": images["obj_noise"]}
     framed = {name: canvas.framed(values) for name, values in channels.items()}
     return Raster(framed | {"influence": canvas.region.weight}, ACESCG)
 

@@ -12,6 +12,7 @@ from pipeline.conventions import latlong_solid_angles
 
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 AXIS_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
+SCALE_SIGMA = "insitu:scale_sigma"  # in a map's header: relative standard uncertainty R G B that all texels share
 _STRADDLE_SPLIT = 8  # a texel cut by the horizon is split 8 x 8: the error of the cut falls by 64 (see irradiance)
 
 

@@ -72,7 +72,8 @@ BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", t
 ENVIRONMENT = Artifact(
     "environment",
     "raster",
-    "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1)",
+    "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1); relative "
+    "sigma that all texels share in the header",
     RADIANCE_UNIT,
     ACESCG,
 )
@@ -102,7 +103,7 @@ LAYERS = Artifact(
     "layers",
     "raster",
     "plate-sized render: obj.RGBA premultiplied, with.RGB (LS_obj) and without.RGB (LS_noobj) of the local scene, "
-    "their difference's variance, influence (0 or 1)",
+    "their difference's variance, noise.change and noise.obj (RMS error left after denoising), influence (0 or 1)",
     RADIANCE_UNIT,
     ACESCG,
 )

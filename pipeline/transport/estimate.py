@@ -418,7 +418,7 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
         noise = np.sqrt(tile_means((images["obj_variance"] + images["change_variance"]).mean(-1)))
     more = needs_more(noise, canvas.plate_sigma[canvas.window][window], tile_means(composite), canvas.white)
     wanted = np.zeros(canvas.part.traced.shape, bool)
-    wanted[window] = np.repeat(np.repeat(more, TILE, 0), TILE, 1)[: here[0], : here[1]]
+    wanted[window] = in_tiles(more, here)
     return wanted.ravel()[canvas.places]
 
 
@@ -468,6 +468,8 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
     It says nothing of fewer than `TRUSTED` samples.
     """
     images = planes_of(canvas, halves.both, (*JUDGED, "ground"))
+    for name in ("change", "obj"):  # RMS over the channels, as the denoiser tells it below
+        images[f"{name}_noise"] = np.sqrt(images[f"{name}_variance"].mean(-1))
     if not canvas.effort.denoise:
         return images, None
     window = bounding_window(canvas.part.traced)
@@ -483,4 +485,13 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
     view["lost"][:] = np.where(ground, np.minimum(survives - 1, 0) * model, view["lost"])
     view["gained"][:] = np.where(ground, added * model, view["gained"])
     view["obj"][:] = np.where(shown, obj, view["obj"])
+    if quiet is not None:
+        left = in_tiles(np.hypot(quiet.survives.noise, quiet.added.noise), here.shape) * model.mean(-1)
+        view["change_noise"][:] = np.where(ground[..., 0], left, view["change_noise"])
+        view["obj_noise"][:] = in_tiles(quiet.obj.noise, here.shape) * view["alpha"]
     return images, quiet
+
+
+def in_tiles(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values (h, w) of tiles at their pixels (H, W)."""
+    return np.repeat(np.repeat(values, TILE, 0), TILE, 1)[: shape[0], : shape[1]]
