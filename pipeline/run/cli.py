@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,8 @@ def build_parser() -> argparse.ArgumentParser:
         sub.add_argument("--scene", type=Path, help="scene.toml (default: the one beside capture.toml)")
         sub.add_argument("--quality", choices=["draft", "preview", "final"], help="preset (default: scene.toml's)")
         sub.add_argument("--set", action="append", default=[], metavar="STAGE.KNOB=VALUE", help="set one knob")
+        sub.add_argument("--max-error", type=float, help="solve for settings that err by at most this share, as 0.02")
+        sub.add_argument("--time-budget", type=float, metavar="CPU_S", help="and take at most so many CPU seconds")
         return looking(sub)
 
     def looking(sub: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -256,7 +259,33 @@ def resolved(args: argparse.Namespace) -> Settings:
     chosen = resolve(
         args.capture, getattr(args, "scene", None), getattr(args, "quality", None), switches, KNOBS, PRESETS
     )
+    if getattr(args, "max_error", None) is not None or getattr(args, "time_budget", None) is not None:
+        chosen = solved(chosen, args)
     return looked_at(chosen, args)
+
+
+def solved(chosen: Settings, args: argparse.Namespace) -> Settings:
+    """The settings that --max-error and --time-budget ask for; a pilot runs where none is known."""
+    from pipeline.run.settings import given, resolve
+    from pipeline.trade.points import Point
+    from stages.knobs import KNOBS, PRESETS
+
+    if args.quality:
+        raise ManifestError("--quality: is given with --max-error or --time-budget, which choose it; leave one out")
+
+    def settle(changes: Mapping[str, Any]) -> Settings:
+        switches = Point("", "", "", tuple(changes.items())).switches
+        return resolve(args.capture, args.scene, "preview", [*switches, *args.set], KNOBS, PRESETS)
+
+    from pipeline.trade.ask import Question, answer
+
+    fixed = given(args.capture, args.scene, args.set, KNOBS)
+    question = Question(args.max_error, args.time_budget, settle, fixed)
+    os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
+    from pipeline.run.runner import Build
+    from stages.order import graph
+
+    return answer(question, Build(graph(), out_of(args), chosen, KNOBS), say)
 
 
 def looked_at(chosen: Settings, args: argparse.Namespace) -> Settings:
@@ -355,6 +384,11 @@ def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
         say(f"{name:<12} {outcome:<6} {seconds:7.2f} s  {variant}".rstrip())
 
     build.run_all(stages, tell)
+    if build.settings.asked:
+        from pipeline.trade.ask import note
+
+        if told := note(build):
+            say(told)
     if args.verb == "run" and last == stage_names()[-1]:
         say(print_summary(build))
     if not build.stop.asked:

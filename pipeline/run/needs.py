@@ -42,7 +42,7 @@ def needs(build: Build) -> dict[str, Any]:
 
 def how_to_run(build: Build) -> str:
     """The command that brings a build up to date."""
-    return f"insitu run {build.settings.capture} --quality {build.settings.quality} --out {build.out}"
+    return f"insitu run {build.settings.capture} {build.settings.switches} --out {build.out}"
 
 
 def stale(build: Build, name: str) -> str:

@@ -18,8 +18,16 @@ class Settings(BaseModel):
 
     capture: str
     scene: str | None
-    quality: str
+    quality: str  # a preset, or "solved"
     params: dict[str, dict[str, Any]]
+    asked: dict[str, float] = {}  # max_error, time_budget [CPU s]: what solved settings answer
+
+    @property
+    def switches(self) -> str:
+        """What to give to ``insitu run`` for these settings again."""
+        if not self.asked:
+            return f"--quality {self.quality}"
+        return " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in self.asked.items())
 
 
 def resolve(
@@ -74,6 +82,19 @@ def resolve(
     return Settings(
         capture=str(capture_file.resolve()), scene=str(path.resolve()) if path else None, quality=quality, params=params
     )
+
+
+def given(
+    capture: Path, scene: Path | None, switches: list[str], knobs: Mapping[str, type[BaseModel]]
+) -> frozenset[str]:
+    """``stage.knob`` of every knob that scene.toml or a switch sets. Raises ManifestError where either is damaged."""
+    path = scene or load_capture(capture)[1].parent / "scene.toml"
+    tables = load_toml(path) if scene or path.is_file() else {}
+    asked, problems = parse_switches(switches, knobs)
+    if problems:
+        raise ManifestError(*problems)
+    own = {name: tables[name] for name in knobs if name in tables}
+    return frozenset(f"{stage}.{knob}" for part in (own, asked) for stage, values in part.items() for knob in values)
 
 
 def parse_switches(

@@ -1,0 +1,242 @@
+"""``--max-error`` and ``--time-budget``: settings for a question, and what became of the prediction, in run.json.
+
+run.json      asked, predicted, reached, settings, and the key of what the answer holds for
+pilot.json    what the pilot measured, and its key; another question of the same capture takes it
+
+The key is a digest of photographs, wishes, code, libraries and the knobs that the user fixed. The same question of the
+same things gets the stored answer.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.run import closure, formats
+from pipeline.run.errors import ManifestError
+from pipeline.run.runner import Build, is_complete
+from pipeline.run.settings import Settings
+from pipeline.trade import model
+from pipeline.trade.model import FIGURES, FINEST, PILOT_WIDTH, Model, Setting
+from pipeline.trade.pilot import FEW, Pilot, stated
+from pipeline.trade.work import LAST, code_of, digest_of, source_of
+
+RUN, PILOT = "run.json", "pilot.json"
+TRUTH = {"object": "object_rel_err", "shadow": "shadow_change_err"}  # figure -> its name among evaluate's
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a run may cost: an error of the final pixels, CPU seconds with the pilot's; either, or both.
+
+    ``settle`` gives the settings with some knobs at these values; ``given`` names the knobs that the user set himself.
+    """
+
+    max_error: float | None
+    time_budget: float | None
+    settle: Callable[[Mapping[str, Any]], Settings]
+    given: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        if self.max_error is not None and not 0 < self.max_error < 1:
+            raise ManifestError(f"--max-error: is {self.max_error:g}; expected a share between 0 and 1, as 0.02")
+        if self.time_budget is not None and not 0 < self.time_budget < math.inf:
+            raise ManifestError(f"--time-budget: is {self.time_budget:g}; expected CPU seconds above 0")
+
+    @property
+    def asked(self) -> dict[str, float]:
+        """What was given of the two."""
+        both = {"max_error": self.max_error, "time_budget": self.time_budget}
+        return {name: value for name, value in both.items() if value is not None}
+
+    def settings(self, changes: Mapping[str, Any]) -> Settings:
+        """Resolved, knobs that the user fixed at his values."""
+        free = {knob: value for knob, value in changes.items() if knob not in self.given}
+        return self.settle(free).model_copy(update={"quality": "solved", "asked": self.asked})
+
+
+def answer(question: Question, build: Build, say: Say) -> Settings:
+    """The settings that the question asks for, after a pilot where none is known. ``build``: any settings; they change.
+
+    Writes run.json. Raises ManifestError when nothing answers, naming what could be had.
+    """
+    build.settings = question.settings(Setting(FEW[-1], PILOT_WIDTH).changes)
+    key = key_of(build)
+    known = read(build.out / RUN)
+    if known.get("key") == key and known.get("asked") == question.asked:
+        say(f"{build.out / RUN}: asked before; its settings are taken")
+        return question.settings(known["settings"])
+    old = read(build.out / PILOT)
+    pilot = Pilot(build, old["pilot"] if old.get("key") == key else None)
+    if not pilot.record:
+        say("pilot: the stages before the render, and three small renders")
+        pilot.begin()
+    setting, found = chosen(question, build, pilot)
+    if setting.samples > FEW[-1] and pilot.is_short:
+        say("pilot: one more small render, of more samples")
+        pilot.extend()
+        setting, found = chosen(question, build, pilot)
+    write(build.out / PILOT, {"key": key, "pilot": pilot.record})
+    check(question, found, setting, pilot.record)
+    told = {
+        "asked": question.asked,
+        "predicted": foretold(found, setting, pilot.record),
+        "reached": None,
+        "settings": {knob: value for knob, value in setting.changes.items() if knob not in question.given},
+        "key": key,
+    }
+    write(build.out / RUN, told)
+    say(in_words(told))
+    return question.settings(setting.changes)
+
+
+def key_of(build: Build) -> str:
+    """Digest of all that an answer depends on but the question. Runs ingest, which is quick."""
+    source, _ = source_of(build, "")
+    code = code_of(build.graph) | {"pilot": closure.digest("pipeline.trade.pilot")}
+    params = {stage.name: build.settings.params[stage.name] for stage in build.graph.upto(LAST)}
+    return digest_of([source, code, build.versions, params])
+
+
+def chosen(question: Question, build: Build, pilot: Pilot) -> tuple[Setting, Model]:
+    """The best setting for the question, or that nearest to it; and the model that says so."""
+    found = model.fitted(pilot.record)
+    params = build.settings.params
+    fixed = {knob: params[knob.split(".")[0]][knob.split(".")[1]] for knob in question.given if knob in FINEST.changes}
+    among = model.candidates(fixed)
+    if question.max_error is not None:
+        setting = model.cheapest(found, among, question.max_error)
+    else:
+        assert question.time_budget is not None
+        setting = model.best_within(found, among, question.time_budget - pilot.record["cpu_seconds"])
+    if setting is None and question.max_error is not None:
+        setting = min(among, key=found.error)
+    return setting or min(among, key=found.left), found
+
+
+def check(question: Question, found: Model, setting: Setting, pilot: Mapping[str, Any]) -> None:
+    """Raise ManifestError when the setting, which is the nearest, is not what was asked."""
+    error, seconds = found.error(setting), found.left(setting) + pilot["cpu_seconds"]
+    if question.max_error is not None and error > question.max_error:
+        least = math.ceil(error * 1e4) / 1e4
+        raise ManifestError(
+            f"--max-error: is {question.max_error:g}; the finest setting, final's {setting.samples} samples and map of "
+            f"{setting.width} px, is predicted to err by {error:.4f}, most of it {largest(found, setting)}; "
+            f"ask {least:g} or more"
+        )
+    if question.time_budget is not None and seconds > question.time_budget:
+        where = f" for an error of {question.max_error:g}" if question.max_error is not None else ""
+        raise ManifestError(
+            f"--time-budget: is {question.time_budget:g} CPU seconds; {seconds:.0f} are needed{where}, of which the "
+            f"pilot took {pilot['cpu_seconds']:.0f}; ask {math.ceil(seconds)} or more"
+            + (", or allow a larger error" if where else "")
+        )
+
+
+def largest(found: Model, setting: Setting) -> str:
+    """The largest part of the larger figure, in words."""
+    parts = found.parts(setting)
+    figure = max(parts, key=lambda name: parts[name]["all"])
+    name = max((part for part in parts[figure] if part != "all"), key=lambda part: parts[figure][part])
+    words = {
+        "sampling": "noise of sampling",
+        "map": "the map's width",
+        "stated": "what the photographs leave uncertain",
+    }
+    return f"{words[name]}, in {figure} pixels"
+
+
+def foretold(found: Model, setting: Setting, pilot: Mapping[str, Any]) -> dict[str, Any]:
+    """The prediction as run.json has it."""
+    cost = found.cost(setting)
+    return {
+        "error": found.error(setting),
+        "figures": found.parts(setting),
+        "cpu_seconds": found.seconds(setting),
+        "stages": cost,
+        "with_pilot_cpu_seconds": found.left(setting) + pilot["cpu_seconds"],
+        "pilot_cpu_seconds": pilot["cpu_seconds"],
+        "wall_seconds_at_the_pilots_pace": found.left(setting) * pilot["wall_over_cpu"],
+        "stated": pilot["stated"],
+        "not_in_it": pilot["bounds"],
+    }
+
+
+def note(build: Build) -> str:
+    """Write into run.json what a finished run reached, and say it in a line; empty when there is nothing to say.
+
+    ``error`` is the model's, with what this run's own records say: noise of its samples, uncertainties of its stages.
+    ``against_truth`` is what `insitu evaluate` found, where there is truth.
+    """
+    told, pilot = read(build.out / RUN), read(build.out / PILOT)
+    records = {stage.name: build.record(stage.name) for stage in build.graph.upto(LAST)}
+    if not (told and pilot and told.get("asked") == build.settings.asked):
+        return ""
+    if any(record is None or not is_complete(record) for record in records.values()):
+        return ""
+    figures = posterior(build, told["predicted"]["figures"], pilot["pilot"])
+    truth = against_truth(build)
+    reached = {
+        "error": max(part["all"] for part in figures.values()),
+        "figures": figures,
+        "cpu_seconds": math.fsum(record["cpu_seconds"] for record in records.values() if record),
+        "stages": {name: record["cpu_seconds"] for name, record in records.items() if record},
+        "against_truth": truth and {"error": max(truth.values()), **truth},
+    }
+    write(build.out / RUN, told | {"reached": reached})
+    seconds = f"{reached['cpu_seconds']:.0f} CPU s (predicted {told['predicted']['cpu_seconds']:.0f})"
+    against = f", {max(truth.values()):.4f} against truth" if truth else ""
+    predicted = f"(predicted {told['predicted']['error']:.4f})"
+    return f"reached: error {reached['error']:.4f} by its own records {predicted}{against}; {seconds}"
+
+
+def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """The predicted parts, noise scaled to what the run's samples had of it, and stated uncertainties as they are now."""
+    numbers = (build.record("render") or {"numbers": {}})["numbers"]
+    samples = build.settings.params["render"]["samples"]
+    last = pilot["renders"][-1]
+    expected = last["noise"] * math.sqrt(last["samples"] / samples)
+    ratio = numbers["object_noise_rel"] / expected if expected and numbers.get("object_noise_rel") else 1.0
+    anew = {figure: math.hypot(0.0, *parts.values()) for figure, parts in stated(build).items()}
+    found = {}
+    for figure in (name for name in FIGURES if name in predicted):
+        old = predicted[figure]
+        parts = {"sampling": old["sampling"] * ratio, "map": old["map"], "stated": anew[figure]}
+        found[figure] = parts | {"all": math.hypot(*parts.values())}
+    return found
+
+
+def against_truth(build: Build) -> dict[str, float]:
+    """Both figures as evaluate found them for this composite; empty without truth, or before evaluate."""
+    record = build.record("evaluate")
+    composite = build.record(LAST)
+    if record is None or composite is None or record["inputs"].get("composite") != composite["outputs"]["composite"]:
+        return {}
+    found = {figure: record["numbers"].get(name) for figure, name in TRUTH.items()}
+    return {figure: value for figure, value in found.items() if value is not None}
+
+
+def in_words(told: Mapping[str, Any]) -> str:
+    """One line on an answer."""
+    predicted = told["predicted"]
+    knobs = ", ".join(f"{knob} {value}" for knob, value in told["settings"].items())
+    return f"predicted: error {predicted['error']:.4f}, {predicted['cpu_seconds']:.0f} CPU s; {knobs}"
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A JSON file; empty when it is missing or damaged."""
+    try:
+        found = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write(path: Path, told: Mapping[str, Any]) -> None:
+    """A JSON file."""
+    formats.write_bytes(path, json.dumps(told, indent=1).encode() + b"\n")

@@ -1,0 +1,193 @@
+"""What a setting will cost and how far its picture will be off, from a pilot of the capture: laws, and their solution.
+
+Two figures, as `insitu evaluate` has them: the relative error of object pixels, and that of the change that shadows
+and thrown light make; each the median over its pixels. The one number is the larger. Independent parts add as squares:
+
+sampling    a n^-p over the samples n, from differences of pilot renders of other samples and seeds
+map         c / w over the probe's width w, from two pilot renders under the map and under it at half its width
+stated      the standard uncertainties of the stages before (exposures, ball, lights, plate), the same for all settings
+
+Of what is no more than bounded (near field, what a photograph cannot show) nothing is in it. Costs are CPU seconds of
+all threads, of the stages up to the composite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+FIGURES = ("object", "shadow")
+SAMPLES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # the last is final's
+WIDTHS = (256, 512, 1024, 2048)  # likewise
+# What goes with the samples: (up to, threshold, depth), as in the presets of as many; and with the width: supersample.
+TIERS = ((16, 0.008, 4), (256, 0.004, 6), (math.inf, 0.001, 10))
+SUPERSAMPLES = ((512, 2), (1024, 3), (math.inf, 4))
+PILOT_WIDTH = 512
+# Share of a stage's CPU at `PILOT_WIDTH` that grows with the texels of map and texture (docs/figures.md: 512 to 2048).
+GROWING = {"probe": 0.155, "lights": 1.0, "reflectance": 0.41}
+COMPOSITE = (0.6, 0.8)  # CPU seconds, and per megapixel of the plate: the bundled captures
+POWERS = tuple(0.2 + 0.02 * step for step in range(26))  # of the samples; 0.5 without a denoiser
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is solved for. Threshold and depth go with the samples, the ground's texture with the map's width."""
+
+    samples: int
+    width: int
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """``stage.knob`` -> value."""
+        _, threshold, depth = next(tier for tier in TIERS if self.samples <= tier[0])
+        return {
+            "probe.width": self.width, "probe.supersample": next(n for most, n in SUPERSAMPLES if self.width <= most),
+            "reflectance.texture_px": self.width, "render.samples": self.samples, "render.threshold": threshold,
+            "render.depth": depth,
+        }  # fmt: skip
+
+
+FINEST = Setting(SAMPLES[-1], WIDTHS[-1])
+
+
+@dataclass(frozen=True)
+class Law:
+    """``scale * n ** -power``."""
+
+    scale: float
+    power: float
+
+    def at(self, n: float) -> float:
+        """The value at n."""
+        return self.scale * n**-self.power
+
+
+def law_of(differences: Mapping[tuple[int, int], float]) -> Law:
+    """The law of which pictures of so many samples differ by this much: ``d_ij^2 = m_i^2 + m_j^2``.
+
+    Least squares of logarithms over `POWERS`; of a single difference the power is 1/2. Raises ValueError without any.
+    """
+    known = {pair: max(value, 1e-9) for pair, value in differences.items()}
+    if not known:
+        raise ValueError("law_of: no difference")
+    best: tuple[float, Law] | None = None
+    for power in POWERS if len(known) > 1 else (0.5,):
+        shapes = {pair: math.hypot(*(n**-power for n in pair)) for pair in known}
+        logs = [math.log(value / shapes[pair]) for pair, value in known.items()]
+        middle = math.fsum(logs) / len(logs)
+        miss = math.fsum((log - middle) ** 2 for log in logs)
+        if best is None or miss < best[0] - 1e-12:
+            best = miss, Law(math.exp(middle), power)
+    assert best is not None
+    return best[1]
+
+
+def line_of(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Intercept and slope, neither negative, of the least-squares line through (x, y)."""
+    x, y = ([point[axis] for point in points] for axis in (0, 1))
+    mean_x, mean_y = math.fsum(x) / len(x), math.fsum(y) / len(y)
+    spread = math.fsum((value - mean_x) ** 2 for value in x)
+    slope = math.fsum((u - mean_x) * (v - mean_y) for u, v in points) / spread if spread else 0.0
+    if slope <= 0:
+        return 0.0, mean_y / mean_x
+    start = mean_y - slope * mean_x
+    return (start, slope) if start >= 0 else (0.0, math.fsum(u * v for u, v in points) / math.fsum(u * u for u in x))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A capture's laws. Built by `fitted`."""
+
+    sampling: dict[str, Law]  # figure -> law over samples
+    width: int  # of the pilot's map
+    map_error: dict[str, float]  # figure -> error at that width
+    stated: dict[str, float]  # figure -> standard uncertainty
+    stages: dict[str, float]  # CPU seconds of the pilot's stages
+    work: Law  # pixel samples of a whole render, with a negative power
+    render: tuple[float, float]  # CPU seconds, and per pixel sample
+    megapixels: float
+
+    def parts(self, setting: Setting) -> dict[str, dict[str, float]]:
+        """Figure -> {sampling, map, stated, all}."""
+        found = {}
+        for figure, law in self.sampling.items():
+            parts = {
+                "sampling": law.at(setting.samples),
+                "map": self.map_error.get(figure, 0.0) * self.width / setting.width,
+                "stated": self.stated.get(figure, 0.0),
+            }
+            found[figure] = parts | {"all": math.hypot(*parts.values())}
+        return found
+
+    def error(self, setting: Setting) -> float:
+        """The larger of the figures."""
+        return max(part["all"] for part in self.parts(setting).values())
+
+    def cost(self, setting: Setting) -> dict[str, float]:
+        """CPU seconds per stage up to the composite."""
+        texels = (setting.width / self.width) ** 2
+        costs = {name: spent * (1 + GROWING.get(name, 0.0) * (texels - 1)) for name, spent in self.stages.items()}
+        costs["render"] = self.render[0] + self.render[1] * self.work.at(setting.samples)
+        costs["composite"] = COMPOSITE[0] + COMPOSITE[1] * self.megapixels
+        return costs
+
+    def seconds(self, setting: Setting) -> float:
+        """CPU seconds of the whole chain."""
+        return math.fsum(self.cost(setting).values())
+
+    def left(self, setting: Setting) -> float:
+        """CPU seconds of what is still to be run after the pilot, which leaves its stages at its width."""
+        done = self.stages if setting.width == self.width else self.stages.keys() - GROWING.keys()
+        return math.fsum(spent for name, spent in self.cost(setting).items() if name not in done)
+
+
+def fitted(pilot: Mapping[str, Any]) -> Model:
+    """The model of a pilot's record (see `pipeline.trade.pilot`): JSON, so pairs of samples are texts, "2-8"."""
+    sampling = {}
+    for figure in FIGURES:
+        known = {
+            pair: values[figure] for pair, values in pilot["differences"].items() if values.get(figure) is not None
+        }
+        if known:
+            sampling[figure] = law_of({(int((ns := pair.split("-"))[0]), int(ns[1])): d for pair, d in known.items()})
+    renders = pilot["renders"]
+    grown = pilot["scale"] ** 2
+    works = [(run["samples"], run["work"] * grown) for run in renders]
+    return Model(
+        sampling=sampling,
+        width=pilot["width"],
+        map_error={figure: value for figure, value in pilot["map"].items() if value is not None},
+        stated={figure: math.hypot(0.0, *parts.values()) for figure, parts in pilot["stated"].items()},
+        stages=pilot["stages"],
+        work=growth_of(works),
+        render=line_of([(run["work"], run["cpu_seconds"]) for run in renders]),
+        megapixels=pilot["megapixels"],
+    )
+
+
+def growth_of(works: Sequence[tuple[float, float]]) -> Law:
+    """The power law of pixel samples over samples, through the first and the last render; at most proportional."""
+    (n0, w0), (n1, w1) = works[0], works[-1]
+    power = min(math.log(w1 / w0) / math.log(n1 / n0), 1.0) if n1 > n0 else 1.0
+    return Law(w1 / n1**power, -power)
+
+
+def candidates(fixed: Mapping[str, Any]) -> list[Setting]:
+    """All settings, those that the user fixed at their value, cheapest first by samples and width."""
+    samples = (int(fixed["render.samples"]),) if "render.samples" in fixed else SAMPLES
+    widths = (int(fixed["probe.width"]),) if "probe.width" in fixed else WIDTHS
+    return [Setting(n, width) for n in samples for width in widths]
+
+
+def cheapest(model: Model, among: Iterable[Setting], error: float) -> Setting | None:
+    """The one that costs least of those that err by at most ``error``; None when none does."""
+    able = [setting for setting in among if model.error(setting) <= error]
+    return min(able, key=lambda setting: (model.seconds(setting), model.error(setting)), default=None)
+
+
+def best_within(model: Model, among: Iterable[Setting], seconds: float) -> Setting | None:
+    """The one that errs least of those whose work that is still to be done takes at most ``seconds``; or None."""
+    able = [setting for setting in among if model.left(setting) <= seconds]
+    return min(able, key=lambda setting: (model.error(setting), model.seconds(setting)), default=None)

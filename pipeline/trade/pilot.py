@@ -1,0 +1,232 @@
+"""A pilot of a capture: its stages up to the plane, once, and a few small renders that differ in one thing each.
+
+The renders see the plate through a camera of fewer pixels. Two of few samples tell how fast sampling converges (the
+noise that the denoiser leaves, which no formula gives); a third, of more, is made only when the first two do not reach
+what is asked. One under a map of half the width, repeated to the same texels so that its paths stay the same, tells
+what the map's width is worth.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from pipeline.image import metrics
+from pipeline.run.artifacts import CAMERA, EMITTERS, HARMONICS, PHOTOGRAPHS
+from pipeline.run.runner import Build
+from pipeline.trade.model import Setting
+from pipeline.types import Camera, Occluder, Raster
+
+LONGEST_PX = 512  # of the pilot's pictures
+FEW, MORE = (2, 8), 32  # samples
+MAP_SAMPLES = FEW[-1]  # of the pair under two maps
+SEED = 1_000  # far from the run's, so that its picture's noise is not the pilot's
+LEAST_PX = 50  # pixels of which a median is taken; fewer are no figure
+SHADOW, GROW = metrics.SHADOW, metrics.GROW
+BOXED = metrics.BOX  # pixels along a box, over which noise that is independent averages
+
+
+def factor_of(camera: Camera) -> int:
+    """How many pixels of the plate, along a side, become one of the pilot's."""
+    return max(1, math.ceil(max(camera.width, camera.height) / LONGEST_PX))
+
+
+def smaller(camera: Camera, factor: int) -> Camera:
+    """The camera with pixels ``factor`` times as large; what does not fill a pixel is cut off."""
+    return camera.model_copy(
+        update={
+            "width": camera.width // factor, "height": camera.height // factor, "fx": camera.fx / factor,
+            "fy": camera.fy / factor, "cx": camera.cx / factor, "cy": camera.cy / factor,
+        }
+    )  # fmt: skip
+
+
+def shrunk(raster: Raster, factor: int) -> Raster:
+    """Means over ``factor`` x ``factor`` pixels; masks by their largest. Variances stay those of one pixel.
+
+    A pilot's pixel is to look as noisy as the plate's own: by that noise the render decides where to stop.
+    """
+    channels = {}
+    for name, values in raster.channels.items():
+        height, width = (size // factor for size in values.shape)
+        cells = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
+        channels[name] = cells.max((1, 3)) if values.dtype.kind == "u" else cells.mean((1, 3), dtype=np.float32)
+    return Raster(channels, raster.space, raster.attributes)
+
+
+def coarser(environment: Raster) -> Raster:
+    """The map at half its width, each texel repeated, so that emitters keep their texels."""
+    half = shrunk(environment, 2)
+    return Raster(
+        {name: values.repeat(2, 0).repeat(2, 1) for name, values in half.channels.items()}, environment.space,
+        environment.attributes,
+    )  # fmt: skip
+
+
+def differences(layers: Raster, other: Raster) -> dict[str, float | None]:
+    """How far layers (of `pipeline.run.artifacts.LAYERS`) are from others, as `insitu evaluate` weighs a composite.
+
+    ``object``: median relative difference where an object covers the pixel; ``shadow``: of the change's 5x5 means where
+    that is over 5 %. None for fewer than `LEAST_PX` pixels.
+    """
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    alpha = other["obj.A"]
+    inside = binary_erosion((alpha > 0.99) & (layers["obj.A"] > 0.99), np.ones((3, 3)), border_value=1)
+    by_pixel = metrics.relative(layers.rgb("obj") - other.rgb("obj"), other.rgb("obj"))
+    ours, theirs = (metrics.box(part.rgb("lost") + part.rgb("gained")) for part in (layers, other))
+    shown = metrics.relative(theirs, metrics.box(other.rgb("without"))) > SHADOW
+    shown &= ~binary_dilation(alpha > 0, np.ones((GROW, GROW))) & np.isfinite(theirs).all(-1)
+    return {
+        "object": _median(by_pixel[inside]),
+        "shadow": _median(metrics.relative(ours - theirs, theirs)[shown]),
+    }
+
+
+def _median(values: np.ndarray) -> float | None:
+    return float(np.median(values)) if values.size >= LEAST_PX else None
+
+
+class Pilot:
+    """Small renders of a build whose stages before the render are run, and the record of them.
+
+    ``build``: settings at the pilot's width. ``record`` is JSON: width of the map, scale (pixels of the plate along a
+    side of one of the pilot's), megapixels, stages [CPU s], renders, differences, map, stated, bounds, wall over CPU
+    seconds, and the CPU seconds that all of it took, the stages' included.
+    """
+
+    def __init__(self, build: Build, record: dict[str, Any] | None = None) -> None:
+        self.build = build
+        self.record: dict[str, Any] = record or {}
+        self.layers: dict[int, Raster] = {}
+        self.inputs: dict[str, Any] = {}
+
+    def begin(self) -> None:
+        """Run the stages, and the renders of `FEW` samples."""
+        cpu, start = time.process_time(), time.perf_counter()
+        records = self._prepared()
+        plate = self.build.value(PHOTOGRAPHS)["plate"]
+        self.record = {
+            "width": self.build.settings.params["probe"]["width"],
+            "scale": factor_of(self.build.value(CAMERA)),
+            "megapixels": plate.shape[0] * plate.shape[1] / 1e6,
+            "stages": {name: found["cpu_seconds"] for name, found in records.items()},
+            "renders": [self._measured(samples) for samples in FEW],
+            "differences": {"-".join(map(str, FEW)): differences(*(self.layers[samples] for samples in FEW))},
+            "map": differences(self._render(MAP_SAMPLES, coarse=True)[0], self.layers[MAP_SAMPLES]),
+            "stated": stated(self.build),
+            "bounds": bounds(records),
+        }
+        spent = time.process_time() - cpu
+        self.record |= {"cpu_seconds": spent, "wall_over_cpu": (time.perf_counter() - start) / spent}
+
+    @property
+    def is_short(self) -> bool:
+        """Whether `extend` can still tell something."""
+        return len(self.record["renders"]) == len(FEW)
+
+    def extend(self) -> None:
+        """One render of `MORE` samples, against the last of `FEW`."""
+        cpu = time.process_time()
+        if FEW[-1] not in self.layers:  # a pilot of an earlier process
+            self._prepared()
+            self._measured(FEW[-1])
+        self.record["renders"] = [*self.record["renders"], self._measured(MORE)]
+        self.record["differences"][f"{FEW[-1]}-{MORE}"] = differences(self.layers[FEW[-1]], self.layers[MORE])
+        self.record["cpu_seconds"] += time.process_time() - cpu
+
+    def _prepared(self) -> dict[str, dict[str, Any]]:
+        """Run the stages before the render, and make its inputs small; the stages' records."""
+        build = self.build
+        before = build.graph.upto("render")[:-1]
+        build.run_all(before, lambda *_: None)
+        inputs = {argument: build.value(artifact) for argument, artifact in build.graph["render"].inputs.items()}
+        camera, plate = inputs["camera"], inputs["photographs"]["plate"]
+        factor = factor_of(camera)
+        self.inputs = inputs | {
+            "camera": smaller(camera, factor),
+            "photographs": {"plate": shrunk(plate, factor)},
+            "occluders": [item for item in inputs["occluders"] if _is_mesh(item)],  # a mask has the plate's size
+        }
+        return {stage.name: build.record(stage.name) or {} for stage in before}
+
+    def _measured(self, samples: int) -> dict[str, float]:
+        """Render, keep the layers, and say what it took and how noisy it was."""
+        cpu = time.process_time()
+        layers, numbers = self._render(samples)
+        spent = time.process_time() - cpu
+        self.layers[samples] = layers
+        traced = numbers.get("traced_fraction", 0.0) * layers.shape[0] * layers.shape[1]
+        return {
+            "samples": samples,
+            "cpu_seconds": spent,
+            "work": max(traced * numbers.get("samples_per_traced_pixel", samples), 1.0),
+            "noise": numbers.get("object_noise_rel", 0.0),
+        }
+
+    def _render(self, samples: int, coarse: bool = False) -> tuple[Raster, dict[str, Any]]:
+        """Layers of the small picture, and the stage's numbers."""
+        build, environment = self.build, self.inputs["environment"]
+        inputs = self.inputs | {"environment": coarser(environment) if coarse else environment}
+        changes = Setting(samples, 0).changes
+        knobs = {knob.removeprefix("render."): value for knob, value in changes.items() if knob.startswith("render.")}
+        params = build.settings.params["render"] | knobs | {"seed": SEED + samples}
+        result = build.graph["render"].compute(**inputs, params=build.knobs["render"].model_validate(params))
+        return result.outputs["layers"], result.numbers
+
+
+def _is_mesh(item: Occluder) -> bool:
+    return item.mask_file is None
+
+
+def stated(build: Build) -> dict[str, dict[str, float]]:
+    """Figure -> {source: relative standard uncertainty}, from what the stages before the render say.
+
+    A scale of the light moves the objects and leaves shadows, which are ratios; these follow the
+    strongest lamp's share. Noise and interpolation of the plate reach a shadow over a box of pixels.
+    """
+    merge, develop, probe = (
+        (build.record(name) or {"numbers": {}})["numbers"] for name in ("merge", "develop", "probe")
+    )
+    harmonics, emitters = build.value(HARMONICS), build.value(EMITTERS)
+    light = share_of(harmonics.sigma[0], harmonics.coefficients[0])
+    interpolated = (develop.get("interpolation") or {}).get("median_rel") or 0.0
+    return {
+        "object": {
+            "light": light,
+            "exposures": float(merge.get("largest_sigma") or 0.0),
+            "ball's reflectance": float(np.median((probe.get("reflectance") or {}).get("sigma_rel") or 0.0)),
+        },
+        "shadow": {
+            "light": light,
+            "strongest lamp": share_of(emitters[0].irradiance_sigma, emitters[0].irradiance) if emitters else 0.0,
+            "plate's noise": noise_of(build.value(PHOTOGRAPHS)["plate"]) / BOXED,
+            "plate's interpolation": float(interpolated) / BOXED,
+        },
+    }
+
+
+def share_of(sigma: np.ndarray, value: np.ndarray) -> float:
+    """Median over channels of a relative uncertainty; of channels without a value, nothing."""
+    known = np.isfinite(sigma) & (value > 0)
+    return float(np.median(sigma[known] / value[known])) if known.any() else 0.0
+
+
+def noise_of(plate: Raster) -> float:
+    """Median relative standard deviation of a pixel, over every 16th pixel with a finite variance."""
+    rgb, variance = plate.rgb()[::4, ::4], plate.rgb("variance")[::4, ::4]
+    known = np.isfinite(variance).all(-1) & (rgb > 0).all(-1)
+    return float(np.median(np.sqrt(variance[known]).mean(-1) / rgb[known].mean(-1))) if known.any() else 0.0
+
+
+def bounds(records: dict[str, dict[str, Any]]) -> list[dict[str, str]]:
+    """What earlier stages left out and can only bound: {stage, term, could_cost}. None of it is in a prediction."""
+    return [
+        {"stage": name, "term": entry["term"], "could_cost": str(entry["could_cost"])}
+        for name, record in records.items()
+        for entry in record.get("evidence") or []
+        if entry.get("modelled") is False and entry.get("could_cost") not in ("", None, "nothing")
+    ]
