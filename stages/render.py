@@ -25,8 +25,9 @@ from pipeline.run.errors import ManifestError
 from pipeline.run.stage import Stage
 from pipeline.transport.caustics import Film
 from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
+from pipeline.transport.near_one import near_one
 from pipeline.transport.passes import Halves, Interrupted
-from pipeline.transport.placing import place_objects
+from pipeline.transport.placing import feet, place_objects
 from pipeline.transport.region import BLUR, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.trace import LensRays, Rays
@@ -73,9 +74,14 @@ def compute(
             {"influenced_fraction": 0.0},
             ["scene.toml: no objects; the plate comes back"],
         )
+    pose = views["plate"].world_from_camera
+    moved = near_one(pose, feet(wishes, plane))
+    if moved is not None:
+        wishes, plane, pose = moved.wishes(wishes), moved.plane(plane), moved.pose(pose)
+        local_proxies, occluders = moved.meshes(local_proxies), moved.meshes(occluders)
     upward = irradiance(environment.rgb(), plane.normal[None])[0]
-    shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi, params.materials)
-    rays = LensRays(camera, views["plate"].world_from_camera)
+    shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi, params.materials, pose[:3, 3])
+    rays = LensRays(camera, pose)
     plate = photographs["plate"]
     sigma = np.sqrt(sum(plate[f"variance.{c}"] for c in "RGB") / np.float32(3))
     some = thinned(plate)
@@ -91,7 +97,7 @@ def compute(
         worlds = build_worlds(plane, albedo.rgb(), light, objects, local_proxies, lamps, surface, occluders)
         return worlds, irradiance(light, plane.normal[None])[0]
 
-    film = film_of(camera, views["plate"].world_from_camera, rays)
+    film = film_of(camera, pose, rays)
     apart = strong(emitters, plane, upward)
     worlds = build_worlds(plane, albedo.rgb(), environment.rgb(), shapes, local_proxies, apart, surface, occluders)
     canvas, left = prepare(worlds, rays, shape, upward, sigma, white, limits, effort, film, tell)
@@ -103,6 +109,8 @@ def compute(
         "lights": len(apart) + 1,
         "variant": use_mitsuba().variant(),
     }
+    if moved is not None:
+        numbers["rendered_about_m"], numbers["rendered_at_scale"] = moved.origin_m.tolist(), moved.scale
     if params.light_groups:
         # What the objects themselves send out is light of one group only, the sky's.
         objects = {"sky": shapes, "lamp": place_objects(wishes, plane, 0.0, params.materials)[0]}
