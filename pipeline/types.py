@@ -110,7 +110,7 @@ class Bracket(Record):
 
 
 class Camera(Record):
-    """Pinhole with Brown distortion. ``K`` and the pixel origin as in conventions: first pixel centre at (0.5, 0.5)."""
+    """A pinhole and its lens. ``K`` and the pixel origin as in conventions: first pixel centre at (0.5, 0.5)."""
 
     width: int
     height: int
@@ -118,8 +118,8 @@ class Camera(Record):
     fy: float
     cx: float
     cy: float
-    distortion: Array = np.zeros(5)  # (5,) k1 k2 p1 p2 k3, OpenCV's order
-    covariance: Array = np.zeros((9, 9))  # of (fx, fy, cx, cy, k1, k2, p1, p2, k3), px and 1
+    distortion: Array = np.zeros(5)  # (5,) Brown, (8,) rational or (4,) fisheye: see pipeline/camera/distortion.py
+    covariance: Array = np.zeros((9, 9))  # of fx, fy, cx, cy (px) and the coefficients of distortion (1)
     rms_px: float = 0.0
     source: str = "given"
     body: str = ""  # with lens and focal_mm: what metadata say of the optics that this is the camera of; "", 0: unknown
@@ -142,7 +142,7 @@ class View(Record):
     points: int  # image points used
     ambiguity: float = np.inf  # squared residual of the second planar solution over the first
     alternative: Array | None = None  # (4, 4) the second planar solution, refined
-    lens_covariance: Array | None = None  # (6, 9) of the pose with Camera's nine numbers; None when given
+    lens_covariance: Array | None = None  # (6, L) of the pose with the camera's L numbers; None when given
     camera: Camera | None = None  # its own body, lens or size; None: the plate's
 
 

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.camera import lens
+from pipeline.camera.distortion import distort, distortion_jacobian, model_of, undistorted
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
 
 BARREL = np.array([-0.28, 0.09, 1.2e-3, -8e-4, -0.012])
 PINCUSHION = np.array([0.12, 0.03, -6e-4, 9e-4, 0.01])
+RATIONAL = np.array([0.42, -0.11, 7e-4, -5e-4, 0.02, 0.71, 0.05, -0.01])
+FISHEYE = np.array([0.031, -0.012, 0.004, -0.0015])
 
 
 def camera_with(distortion: np.ndarray, width: int = 1024, height: int = 768) -> Camera:
@@ -22,7 +25,7 @@ def pixels_of(camera: Camera, count: int = 4000) -> np.ndarray:
     return rng.uniform(0, 1, (count, 2)) * (camera.width, camera.height)
 
 
-@pytest.mark.parametrize("distortion", [np.zeros(5), BARREL, PINCUSHION])
+@pytest.mark.parametrize("distortion", [np.zeros(5), BARREL, PINCUSHION, RATIONAL, FISHEYE, np.zeros(4)])
 def test_unproject_inverts_project(distortion: np.ndarray) -> None:
     camera = camera_with(distortion)
     px = pixels_of(camera)
@@ -59,8 +62,9 @@ def test_jitter_through_the_derivative_stays_on_the_pixel() -> None:
     assert np.abs(lens.project(camera, rays) - aim).max() < 1e-3  # second order: |f''| / 8 of strong barrel distortion
 
 
-def test_jacobians_against_differences() -> None:
-    camera = camera_with(BARREL)
+@pytest.mark.parametrize("distortion", [BARREL, RATIONAL, FISHEYE])
+def test_jacobians_against_differences(distortion: np.ndarray) -> None:
+    camera = camera_with(distortion)
     points = lens.pixel_rays(camera, pixels_of(camera, 50)) * 2.0
     px, by_point, by_lens = lens.project_jacobians(camera, points)
     np.testing.assert_allclose(px, lens.project(camera, points), atol=1e-10)
@@ -75,15 +79,16 @@ def test_jacobians_against_differences() -> None:
         other = Camera(width=1024, height=768, fx=fx, fy=fy, cx=cx, cy=cy, distortion=vector[4:])
         return lens.project(other, points)
 
-    for column in range(9):
-        step = 1e-5 * np.eye(9)[column]
+    for column in range(len(values)):
+        step = 1e-5 * np.eye(len(values))[column]
         numeric = (moved(values + step) - moved(values - step)) / 2e-5
         np.testing.assert_allclose(by_lens[:, :, column], numeric, rtol=1e-5, atol=1e-5)
 
 
-def test_agrees_with_opencv() -> None:
+@pytest.mark.parametrize("distortion", [PINCUSHION, RATIONAL])
+def test_agrees_with_opencv(distortion: np.ndarray) -> None:
     cv2 = pytest.importorskip("cv2")
-    camera = camera_with(PINCUSHION)
+    camera = camera_with(distortion)
     points = lens.pixel_rays(camera, pixels_of(camera, 200)) * 1.7
     K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, camera.distortion)[0].reshape(-1, 2)
@@ -100,3 +105,65 @@ def test_behind_and_beyond_the_fold() -> None:
     assert np.isfinite(px[3]).all()
     with pytest.raises(NumericalError, match="1 of 1 positions"):
         lens.unproject(camera, np.array([[4000.0, 400.0]]))
+
+
+def wide(distortion: np.ndarray = FISHEYE) -> Camera:
+    """140 degrees across: theta of the corner is 80 degrees."""
+    return Camera(width=1024, height=768, fx=452.0, fy=450.0, cx=515.0, cy=380.0, distortion=distortion)
+
+
+def test_a_fisheye_agrees_with_opencv() -> None:
+    cv2 = pytest.importorskip("cv2")
+    camera = wide()
+    points = lens.pixel_rays(camera, pixels_of(camera, 200)) * 1.7
+    assert np.degrees(np.arccos(points[:, 2] / 1.7)).max() > 75
+    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    theirs = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, FISHEYE)[0].reshape(-1, 2)
+    np.testing.assert_allclose(lens.project(camera, points), theirs + 0.5, atol=1e-8)
+
+
+@pytest.mark.parametrize("camera", [wide(), wide(RATIONAL)], ids=["fisheye", "rational"])
+def test_a_wide_lens_round_trips_in_single_precision(camera: Camera) -> None:
+    """Required: 0.01 px. A float32 ray turns by 6e-8 rad, and a pixel of these lenses is 2e-3 rad: 1e-4 px."""
+    px = pixels_of(camera)
+    xn, dxn = lens.rays_through(camera, px)
+    rays = np.concatenate([xn, np.ones((len(xn), 1))], -1).astype(np.float32)
+    assert np.abs(lens.project(camera, rays) - px).max() < 2e-3
+    step = 1e-3
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        numeric = (lens.unproject(camera, px + shift) - lens.unproject(camera, px - shift)) / (2 * step)
+        np.testing.assert_allclose(dxn[..., axis], numeric, rtol=1e-4, atol=1e-9)
+
+
+def test_on_the_axis_a_fisheye_is_smooth() -> None:
+    """Series and formula meet: at the radius where one takes over from the other both are alike to rounding."""
+    near, far = np.array([[9.99e-4, 0.0]]), np.array([[1.001e-3, 0.0]])
+    slope = (distort(FISHEYE, far) - distort(FISHEYE, near)) / 2e-6
+    assert slope[0, 0] == pytest.approx(distortion_jacobian(FISHEYE, (near + far) / 2)[0, 0, 0], abs=1e-9)
+    np.testing.assert_allclose(
+        distortion_jacobian(FISHEYE, near), distortion_jacobian(FISHEYE, far), atol=1e-8
+    )  # curvature times 2e-6
+    assert np.array_equal(distort(FISHEYE, np.zeros((1, 2))), np.zeros((1, 2)))
+
+
+def test_regions_end_where_the_curve_turns() -> None:
+    pole = np.array([0.0, 0, 0, 0, 0, -0.25, 0, 0])  # 1 / (1 - s / 4): a pole at r = 2, growing until then
+    assert lens.fold_radius_squared(pole) == pytest.approx(4.0)
+    turning = np.array([-0.1, 0, 0, 0, 0, 0.1, 0, 0])
+    r = np.linspace(0.01, 4, 40000)
+    bent = distort(turning, np.stack([r, 0 * r], -1))[:, 0]
+    assert np.sqrt(lens.fold_radius_squared(turning)) == pytest.approx(r[np.argmax(bent)], abs=2e-4)
+    # a fisheye that folds at 1 / sqrt(3 * 0.2) = 1.29 rad, and one that is only bounded by the half sphere
+    assert np.arctan(np.sqrt(lens.fold_radius_squared(np.array([-0.2, 0, 0, 0])))) == pytest.approx(1 / np.sqrt(0.6))
+    assert np.degrees(np.arctan(np.sqrt(lens.fold_radius_squared(np.zeros(4))))) == pytest.approx(88.0)
+    camera = wide(np.zeros(4)).model_copy(update={"fx": 350.0, "fy": 350.0})  # its corners look beyond 90 degrees
+    y, x = np.mgrid[:768:8, :1024:8] + 0.5
+    px = np.stack([x, y], -1).reshape(-1, 2)
+    angle = np.hypot(*((px - (camera.cx, camera.cy)) / 350.0).T)
+    _, inside = undistorted(camera.distortion, (px - (camera.cx, camera.cy)) / 350.0)
+    assert np.array_equal(inside, angle < np.radians(88.0))
+    with pytest.raises(NumericalError, match=f"{int((~inside).sum())} of {len(px)} positions"):
+        lens.unproject(camera, px)
+    with pytest.raises(NumericalError, match=r"6 coefficients .* needed one of 5 \(brown\)"):
+        model_of(np.zeros(6))

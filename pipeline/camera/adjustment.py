@@ -1,7 +1,7 @@
 """Joint adjustment of one lens and the poses of its board photographs, with the lens's covariance.
 
 Gauss-Newton with Levenberg's damping on the reprojection error; the poses are eliminated by Schur's complement. Which
-of (fx fy cx cy k1 k2 p1 p2 k3) are free is a matrix, so that one focal length for both axes is a column, not a case.
+of the lens's numbers are free is a matrix, so that one focal length for both axes is a column, not a case.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.camera.distortion import TERMS, model_of
 from pipeline.camera.resection import residuals_and_jacobian
 from pipeline.camera.rigid import perturb
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+FRAME = ("fx", "fy", "cx", "cy")  # what every lens has, before the coefficients of its distortion
 
 
 @dataclass(frozen=True)
@@ -33,19 +34,24 @@ class Adjustment:
         return float(np.sqrt((np.concatenate(self.residuals_px) ** 2).sum(-1).mean()))
 
 
-def free_columns(terms: tuple[str, ...], one_focal: bool) -> np.ndarray:
-    """(9, K) matrix of what moves: the focal length(s), the principal point and the named distortion terms."""
-    columns = [np.eye(9)[:, [0, 1]].sum(1)] if one_focal else [np.eye(9)[:, 0], np.eye(9)[:, 1]]
-    return np.stack([*columns, *(np.eye(9)[:, LENS.index(term)] for term in ("cx", "cy", *terms))], -1)
+def free_columns(terms: tuple[str, ...], one_focal: bool, count: int = 5) -> np.ndarray:
+    """(L, K) matrix of what moves: the focal length(s), the principal point and the named terms of distortion.
+
+    ``count`` of the coefficients tells the model (`pipeline/camera/distortion.py`).
+    """
+    names = FRAME + TERMS[count]
+    each = np.eye(len(names))
+    columns = [each[:, [0, 1]].sum(1)] if one_focal else [each[:, 0], each[:, 1]]
+    return np.stack([*columns, *(each[:, names.index(term)] for term in ("cx", "cy", *terms))], -1)
 
 
 def lens_vector(camera: Camera) -> np.ndarray:
-    """(9,) in the order of `LENS`."""
+    """(L,) fx fy cx cy and the coefficients of distortion."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def with_lens(camera: Camera, lens: np.ndarray) -> Camera:
-    """The camera with other numbers (9,)."""
+    """The camera with other numbers (L,)."""
     fx, fy, cx, cy = (float(v) for v in lens[:4])
     return camera.model_copy(update={"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": np.array(lens[4:])})
 
@@ -90,7 +96,7 @@ def _normal_equations(
     cross, pose_pose, pose_gradient, cost = [], [], [], 0.0
     for pose, points, seen in zip(poses, world_m, px, strict=True):
         residuals, by_pose, by_lens = residuals_and_jacobian(camera, pose, points, seen)
-        flat, lens, r = by_pose.reshape(-1, 6), by_lens.reshape(-1, 9) @ free, residuals.ravel()
+        flat, lens, r = by_pose.reshape(-1, 6), np.concatenate(by_lens) @ free, residuals.ravel()
         lens_lens += lens.T @ lens
         lens_gradient += lens.T @ r
         cross.append(lens.T @ flat)
@@ -136,8 +142,8 @@ def _finish(
     lens_lens, cross, pose_pose, _, cost = system
     if not np.isfinite(cost):
         raise NumericalError(
-            f"calibrate: no lens of Brown's model images all corners of {len(poses)} board photographs; a fisheye is "
-            "not modelled; if it is none, check squares and square_m of [board]"
+            f"calibrate: no lens of the {model_of(camera.distortion)} model images all corners of {len(poses)} board "
+            "photographs, needed one that does; check squares and square_m of [board]"
         )
     residuals = [residuals_and_jacobian(camera, *item)[0] for item in zip(poses, world_m, px, strict=True)]
     reduced = lens_lens - sum(c @ np.linalg.solve(p, c.T) for c, p in zip(cross, pose_pose, strict=True))

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.camera.adjustment import with_lens
+from pipeline.camera.adjustment import lens_vector, with_lens
 from pipeline.camera.lens import project, project_jacobians
 from pipeline.camera.rigid import camera_points, perturb, skew
 from pipeline.conventions import transform_points
@@ -65,8 +65,8 @@ class Bundle:
 class Adjusted:
     """The adjusted bundle with its noise and covariances.
 
-    ``pose_covariance``: (N, 6, 6) without the held lenses' part; ``by_lens``: (N, 6, 9) derivative of the pose by the
-    lens of that view, held; ``lens_covariance``: (9, 9) of each estimated lens; ``marker_covariance``: (J, 6, 6).
+    ``pose_covariance``: (N, 6, 6) without the held lenses' part; ``by_lens``: N of (6, L), the pose's derivative by
+    the lens of that view, held; ``lens_covariance``: (L, L) of each estimated lens; ``marker_covariance``: (J, 6, 6).
     """
 
     bundle: Bundle
@@ -74,7 +74,7 @@ class Adjusted:
     corner_sigma_px: float
     used: np.ndarray  # (K,) bool: sightings that were not left out
     pose_covariance: np.ndarray
-    by_lens: np.ndarray
+    by_lens: list[np.ndarray]
     lens_covariance: list[np.ndarray]
     marker_covariance: np.ndarray
     deviance: float  # robust cost in units of the noise, for comparing models on the same sightings
@@ -84,7 +84,7 @@ class Adjusted:
 class _Layout:
     """Where each unknown but the points stands in the reduced system."""
 
-    lens: list[np.ndarray]  # (9, k) free columns of each lens
+    lens: list[np.ndarray]  # (L, k) free columns of each lens
     lens_at: list[int]
     pose_at: np.ndarray  # (N,), -1 when held
     marker_at: np.ndarray
@@ -97,7 +97,7 @@ class _Terms:
 
     residuals: np.ndarray  # (K + C, 2) px
     by_pose: np.ndarray  # (.., 2, 6)
-    by_lens: np.ndarray  # (.., 2, 9)
+    by_lens: np.ndarray  # (.., 2, L) of the longest lens, zero beyond a shorter one's
     by_point: np.ndarray  # (K, 2, 3)
     by_marker: np.ndarray  # (C, 2, 6)
     view: np.ndarray
@@ -113,8 +113,8 @@ def adjust(
 
     Args:
         bundle: start and measurements; without a cloud (M = K = 0) the markers alone hold the views together.
-        free: (9, k) for each lens: what of it moves (`adjustment.free_columns`); None holds all.
-        prior: (9,) standard uncertainty of each lens's start; infinite where nothing is known.
+        free: (L, k) for each lens: what of it moves (`adjustment.free_columns`); None holds all.
+        prior: (L,) standard uncertainty of each lens's start; infinite where nothing is known.
         hold_first: hold the first pose and the distance of the farthest other: for a cloud without markers.
         corner_sigma_px: of a marker's corner; estimated when None and there are enough of them.
         like: take noise and outliers from this fit of the same sightings, so that two models can be compared.
@@ -127,9 +127,9 @@ def adjust(
         )
     if not bundle.corners and not hold_first:
         raise NumericalError("bundle: nothing fixes metre and frame, needed markers in two views; photograph a marker")
-    layout = _layout(bundle, free or [np.zeros((9, 0))] * len(bundle.cameras), hold_first)
+    layout = _layout(bundle, free or _held(bundle), hold_first)
     start = bundle
-    priors = prior or [np.full(9, np.inf)] * len(bundle.cameras)
+    priors = prior or _unknown(bundle)
     anchor = _anchor(bundle) if hold_first else None
     used = (np.bincount(bundle.seen_point, minlength=len(bundle.points)) > 1)[bundle.seen_point]
     sigma = (1.0, corner_sigma_px or 0.1)
@@ -148,8 +148,7 @@ def adjust(
 def settled(bundle: Bundle, corner_sigma_px: float) -> tuple[Bundle, float]:
     """A bundle without a cloud at its minimum, lenses held, and chi-square of its corners there."""
     none, sigma = np.zeros(0, bool), (1.0, corner_sigma_px)
-    layout, priors = _layout(bundle, [np.zeros((9, 0))] * len(bundle.cameras), False), [np.full(9, np.inf)]
-    priors *= len(bundle.cameras)
+    layout, priors = _layout(bundle, _held(bundle), False), _unknown(bundle)
     found = _descend(bundle, bundle, layout, priors, None, none, sigma)
     return found, _cost(_residuals(found), none, sigma)
 
@@ -188,12 +187,14 @@ def _terms(bundle: Bundle) -> _Terms:
     place += [transform_points(bundle.markers[c.marker], c.points) for c in corners]
     world, px = np.concatenate(place), np.concatenate([bundle.px, *(c.px for c in corners)])
     residuals, by_pose = np.empty((len(px), 2)), np.empty((len(px), 2, 6))
-    by_lens, by_world = np.empty((len(px), 2, 9)), np.empty((len(px), 2, 3))
+    longest = max(len(lens_vector(camera)) for camera in bundle.cameras)
+    by_lens, by_world = np.zeros((len(px), 2, longest)), np.empty((len(px), 2, 3))
     for number, pose in enumerate(bundle.poses):
         mine = np.flatnonzero(view == number)
         points, moved = camera_points(pose, world[mine])
         predicted, by_point, lens = project_jacobians(bundle.cameras[bundle.camera_of[number]], points)
-        residuals[mine], by_pose[mine], by_lens[mine] = px[mine] - predicted, by_point @ moved, lens
+        residuals[mine], by_pose[mine] = px[mine] - predicted, by_point @ moved
+        by_lens[mine, :, : lens.shape[2]] = lens
         by_world[mine] = by_point @ pose[:3, :3].T
     arm = world[count:] - np.array([bundle.markers[m][:3, 3] for m in marker]).reshape(-1, 3)
     by_motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], -1)
@@ -240,13 +241,17 @@ def _cost(residuals: np.ndarray, used: np.ndarray, sigma: tuple[float, float]) -
 
 def _penalty(bundle: Bundle, start: Bundle, priors: list[np.ndarray]) -> float:
     return sum(
-        float((((_lens(camera) - _lens(first)) / sigma)[np.isfinite(sigma)] ** 2).sum())
+        float((((lens_vector(camera) - lens_vector(first)) / sigma)[np.isfinite(sigma)] ** 2).sum())
         for camera, first, sigma in zip(bundle.cameras, start.cameras, priors, strict=True)
     )
 
 
-def _lens(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+def _held(bundle: Bundle) -> list[np.ndarray]:
+    return [np.zeros((len(lens_vector(camera)), 0)) for camera in bundle.cameras]
+
+
+def _unknown(bundle: Bundle) -> list[np.ndarray]:
+    return [np.full(len(lens_vector(camera)), np.inf) for camera in bundle.cameras]
 
 
 _System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -289,7 +294,7 @@ def _system(
             continue
         place = slice(layout.lens_at[number], layout.lens_at[number] + columns.shape[1])
         mine = bundle.camera_of[view] == number
-        lens = by_lens[mine] @ columns
+        lens = by_lens[mine, :, : len(columns)] @ columns
         U[place, place] += np.tensordot(lens, lens, ([0, 1], [0, 1]))
         gradient[place] += np.tensordot(lens, residuals[mine], ([0, 1], [0, 1]))
         W[:, place] = _summed(lens.transpose(0, 2, 1) @ by_point[mine], index[mine], many).transpose(2, 1, 0)
@@ -302,7 +307,9 @@ def _system(
         place = slice(layout.lens_at[number], layout.lens_at[number] + columns.shape[1])
         strength = np.where(np.isfinite(known), 1 / np.where(np.isfinite(known), known, 1) ** 2, 0)
         U[place, place] += columns.T @ (strength[:, None] * columns)
-        gradient[place] -= columns.T @ (strength * (_lens(bundle.cameras[number]) - _lens(start.cameras[number])))
+        gradient[place] -= columns.T @ (
+            strength * (lens_vector(bundle.cameras[number]) - lens_vector(start.cameras[number]))
+        )
     if anchor is not None:
         far, direction, hold = anchor
         place = slice(layout.pose_at[far] + 3, layout.pose_at[far] + 6)
@@ -325,7 +332,7 @@ def _marker_equations(
     for number, columns in enumerate(layout.lens):
         mine = bundle.camera_of[view] == number
         place = slice(layout.lens_at[number], layout.lens_at[number] + columns.shape[1])
-        jacobian[mine, :, place] = terms.by_lens[first:][mine] @ columns
+        jacobian[mine, :, place] = terms.by_lens[first:][mine, :, : len(columns)] @ columns
     weighted = jacobian * weight[first:, None, None]
     return (
         np.tensordot(weighted, jacobian, ([0, 1], [0, 1])),
@@ -349,7 +356,7 @@ def _reduce(system: _System, damping: float) -> tuple[np.ndarray, np.ndarray, np
 def _moved(bundle: Bundle, layout: _Layout, step: np.ndarray, points: np.ndarray) -> Bundle:
     """The bundle after a step of the reduced unknowns (n,) and the points (M, 3)."""
     cameras = [
-        with_lens(camera, _lens(camera) + columns @ step[at : at + columns.shape[1]])
+        with_lens(camera, lens_vector(camera) + columns @ step[at : at + columns.shape[1]])
         for camera, columns, at in zip(bundle.cameras, layout.lens, layout.lens_at, strict=True)
     ]
     poses = [
@@ -443,19 +450,20 @@ def _finish(
     return Adjusted(bundle, *sigma, used, poses, by_lens, lenses, markers, deviance)
 
 
-def _by_lens(bundle: Bundle, hold_first: bool, used: np.ndarray, sigma: tuple[float, float]) -> np.ndarray:
-    """(N, 6, 9) how each pose answers when its own lens is moved and all else adjusts again: -S_pp^-1 S_pl."""
-    answer = np.zeros((len(bundle.poses), 6, 9))
+def _by_lens(bundle: Bundle, hold_first: bool, used: np.ndarray, sigma: tuple[float, float]) -> list[np.ndarray]:
+    """N of (6, L): how each pose answers when its own lens is moved and all else adjusts again: -S_pp^-1 S_pl."""
+    sizes = [len(lens_vector(camera)) for camera in bundle.cameras]
+    answer = [np.zeros((6, sizes[number])) for number in bundle.camera_of]
     for number in range(len(bundle.cameras)):
-        free = [np.eye(9) if n == number else np.zeros((9, 0)) for n in range(len(bundle.cameras))]
+        size = sizes[number]
+        free = [np.eye(size) if n == number else held for n, held in enumerate(_held(bundle))]
         layout = _layout(bundle, free, hold_first)
-        unknown = [np.full(9, np.inf)] * len(bundle.cameras)
         anchor = _anchor(bundle) if hold_first else None
-        reduced, _, _ = _reduce(_system(bundle, bundle, layout, unknown, anchor, used, sigma), 0.0)
-        moved = -np.linalg.solve(reduced[9:, 9:], reduced[9:, :9])
+        reduced, _, _ = _reduce(_system(bundle, bundle, layout, _unknown(bundle), anchor, used, sigma), 0.0)
+        moved = -np.linalg.solve(reduced[size:, size:], reduced[size:, :size])
         for view, at in enumerate(layout.pose_at):
             if at >= 0 and bundle.camera_of[view] == number:
-                answer[view] = moved[at - 9 : at - 3]
+                answer[view] = moved[at - size : at - size + 6]
     return answer
 
 

@@ -17,18 +17,23 @@ LARGEST_SIDE_PX = 2400  # features are found on pictures at most this large
 FEATURES = 6000  # of a photograph
 FEWEST_POINTS = 30
 FREE_MODEL, KNOWN_MODEL = "SIMPLE_RADIAL", "FULL_OPENCV"  # the latter is Brown's with its denominator 1
+FISHEYE_MODEL = "OPENCV_FISHEYE"
 
 
 def colmap_camera(camera: Camera) -> Any:
     """The same camera for pycolmap; FULL_OPENCV is Brown's model when its denominator is 1."""
     import pycolmap
 
-    return pycolmap.Camera(model=KNOWN_MODEL, width=camera.width, height=camera.height, params=_params(camera))
+    model, params = _model(camera)
+    return pycolmap.Camera(model=model, width=camera.width, height=camera.height, params=params)
 
 
-def _params(camera: Camera) -> list[float]:
-    k1, k2, p1, p2, k3 = camera.distortion
-    return [camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, p1, p2, k3, 0, 0, 0]
+def _model(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's name of a known lens and its numbers."""
+    frame, bend = [camera.fx, camera.fy, camera.cx, camera.cy], list(camera.distortion)
+    if len(bend) == 4:
+        return FISHEYE_MODEL, frame + bend
+    return KNOWN_MODEL, frame + bend + [0.0] * (8 - len(bend))
 
 
 def pose_of_points(camera: Camera, world_points: np.ndarray, px: np.ndarray, max_error_px: float) -> np.ndarray:
@@ -119,7 +124,7 @@ def _extract(database: Path, folder: Path, files: list[str], camera: Camera, thr
 
     reader = pycolmap.ImageReaderOptions()
     if _known(camera):
-        reader.camera_model, params = KNOWN_MODEL, _params(camera)
+        reader.camera_model, params = _model(camera)
     else:
         reader.camera_model, params = FREE_MODEL, [camera.fx, camera.cx, camera.cy, camera.distortion[0]]
     reader.camera_params = ",".join(repr(float(value)) for value in params)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from pipeline.camera.distortion import MODELS
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.types import Camera, Frame
 
@@ -29,8 +30,9 @@ def read_camera(path: Path) -> Camera:
     numbers = np.concatenate(
         [[camera.fx, camera.fy, camera.cx, camera.cy], camera.distortion, camera.covariance.ravel()]
     )
-    shapes = (camera.distortion.shape, camera.covariance.shape)
-    if shapes != ((5,), (9, 9)) or not np.isfinite(numbers).all() or min(camera.fx, camera.fy) <= 0:
+    size = 4 + camera.distortion.size
+    shaped = camera.distortion.ndim == 1 and size - 4 in MODELS and camera.covariance.shape == (size, size)
+    if not shaped or not np.isfinite(numbers).all() or min(camera.fx, camera.fy) <= 0:
         raise ManifestError(f"is {path.name!r}, whose numbers are no camera's; calibrate again")
     return camera
 

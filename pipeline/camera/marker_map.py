@@ -58,7 +58,7 @@ class MarkerMap:
         return np.concatenate(world), np.concatenate([one.px for one in kept]), np.concatenate(ids)
 
     def covariance(self, name: str, lens: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Covariance (6, 6) of a view's pose with its lens's part, and with the lens (6, 9)."""
+        """Covariance (6, 6) of a view's pose with its lens's part, and with the lens (6, L)."""
         at = self.names.index(name)
         by_lens = self.done.by_lens[at]
         own = self.done.pose_covariance[at] + by_lens @ lens.covariance @ by_lens.T

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.camera.lens import distort, unproject
+from pipeline.camera.distortion import distort
+from pipeline.camera.lens import unproject
 from pipeline.conventions import WORLD_FROM_MARKER, transform_points
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera.distortion import model_of
 from pipeline.conventions import HALF_PIXEL, WORLD_FROM_BOARD, transform_points
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.types import Camera
@@ -107,7 +108,7 @@ def board_sightings(
 
     small, step = shrunk(picture)
     options = cv2.aruco.CharucoParameters()
-    if camera is not None:
+    if camera is not None and model_of(camera.distortion) != "fisheye":  # which its detector does not know
         K = camera.K.copy()
         K[:2] /= step
         K[:2, 2] -= HALF_PIXEL

@@ -26,7 +26,7 @@ FLAT = 1e-3  # points whose least extent is below this fraction of the largest a
 
 @dataclass(frozen=True)
 class Resection:
-    """A refined pose (4, 4), covariances (6, 6), covariance with the lens (6, 9), residuals (N, 2) px."""
+    """A refined pose (4, 4), covariances (6, 6), covariance with the lens (6, L), residuals (N, 2) px."""
 
     world_from_camera: np.ndarray
     covariance: np.ndarray
@@ -47,7 +47,7 @@ class Resection:
 def residuals_and_jacobian(
     camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (N, 2) measured - predicted, derivative of the prediction by the pose (N, 2, 6) and lens (N, 2, 9)."""
+    """Residuals (N, 2) measured - predicted, derivative of the prediction by the pose (N, 2, 6) and lens (N, 2, L)."""
     points, by_pose = camera_points(pose, world_points)
     predicted, by_point, by_lens = project_jacobians(camera, points)
     return px - predicted, by_point @ by_pose, by_lens
@@ -123,7 +123,7 @@ def refine(
     residuals, jacobian, by_lens = residuals_and_jacobian(camera, pose, world_points, px)
     squares = float((residuals[kept] ** 2).sum())
     sigma = max(sigma_px, np.sqrt(squares / max(2 * kept.sum() - 6, 1)))
-    flat, lens = jacobian[kept].reshape(-1, 6), by_lens[kept].reshape(-1, 9)
+    flat, lens = jacobian[kept].reshape(-1, 6), np.concatenate(by_lens[kept])
     normal = flat.T @ flat
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(size, size)
@@ -141,12 +141,21 @@ def refine(
 
 
 def planar_candidates(camera: Camera, world_points: np.ndarray, px: np.ndarray) -> list[np.ndarray]:
-    """Both analytic poses (4, 4) ``world_from_camera`` of coplanar points, best first."""
+    """Both analytic poses (4, 4) ``world_from_camera`` of coplanar points, best first.
+
+    Raises NumericalError when all but one of the points lie on a line.
+    """
     from pipeline.camera.opencv_bridge import planar_poses
 
     world_from_plane, _ = plane_frame(world_points)
     flat = (world_points - world_from_plane[:3, 3]) @ world_from_plane[:3, :3]
-    return [world_from_plane @ invert_rigid(pose) for pose in planar_poses(flat[:, :2], unproject(camera, px))]
+    found = planar_poses(flat[:, :2], unproject(camera, px))
+    if not found:  # all but one on a line: no homography
+        raise NumericalError(
+            f"pose: {len(px)} points, too many of them on one line to tell a plane, needed 4 of which no 3 are; show "
+            "more of the board"
+        )
+    return [world_from_plane @ invert_rigid(pose) for pose in found]
 
 
 def is_planar(world_points: np.ndarray) -> bool:

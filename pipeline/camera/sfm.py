@@ -92,7 +92,8 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
     start = reconstruction.cameras[body]
     long = max(start.width, start.height)
     prior = np.array([FOCAL_SIGMA * long] * 2 + [CENTRE_SIGMA * long] * 2 + [np.inf] * 5)
-    priors = [prior if n == body else np.full(9, np.inf) for n in range(len(reconstruction.cameras))]
+    others = [len(lens_vector(camera)) for camera in reconstruction.cameras]
+    priors = [prior if n == body else np.full(size, np.inf) for n, size in enumerate(others)]
 
     bundle = bundle_of(reconstruction, reconstruction.cameras)
 
@@ -100,7 +101,7 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
         columns = free_columns(terms, True)
         lens = lens_vector(start.cameras[body]) * (columns.sum(1) > 0)
         cameras = [with_lens(c, lens) if n == body else c for n, c in enumerate(start.cameras)]
-        free = [columns if n == body else np.zeros((9, 0)) for n in range(len(cameras))]
+        free = [columns if n == body else np.zeros((size, 0)) for n, size in enumerate(others)]
         return adjust(replace(start, cameras=cameras), free, priors, hold_first=True, like=like)
 
     # noise and outliers are those of the richest model: by a poorer one's, its own misfit would pass for noise

@@ -137,7 +137,7 @@ def _fit(
     residuals, jacobian, lens = _terms(camera, local, px, whiten, pose)
     chi2 = float((residuals**2).sum())
     factor = max(1.0, chi2 / max(2 * len(px) - 6, 1))
-    flat, by_lens = jacobian.reshape(-1, 6), lens.reshape(-1, 9)
+    flat, by_lens = jacobian.reshape(-1, 6), np.concatenate(lens)
     normal = flat.T @ flat
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(size, size)

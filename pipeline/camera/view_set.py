@@ -14,7 +14,8 @@ from itertools import product
 import numpy as np
 
 from pipeline.camera.adjustment import free_columns
-from pipeline.camera.lens import distortion_jacobian, project, project_jacobians, unproject
+from pipeline.camera.distortion import distortion_jacobian
+from pipeline.camera.lens import project, project_jacobians, unproject
 from pipeline.camera.resection import residuals_and_jacobian
 from pipeline.camera.rigid import camera_points, rotation_exp
 from pipeline.types import Camera
@@ -48,7 +49,7 @@ class ViewSet:
 def information(camera: Camera, pose: np.ndarray, world_m: np.ndarray, px: np.ndarray) -> np.ndarray:
     """(5, 5) of (f, cx, cy, k1, k2) from one photograph, its pose free, corners of 1 px."""
     _, by_pose, by_lens = residuals_and_jacobian(camera, pose, world_m, px)
-    lens = by_lens.reshape(-1, 9) @ free_columns(("k1", "k2"), True)
+    lens = np.concatenate(by_lens) @ free_columns(("k1", "k2"), True, len(camera.distortion))
     turned = by_pose.reshape(-1, 6)
     along = np.linalg.lstsq(turned, lens, rcond=None)[0]
     return np.asarray(lens.T @ (lens - turned @ along))
@@ -62,7 +63,8 @@ def lens_sigma(camera: Camera, total: np.ndarray, sigma_px: float) -> tuple[floa
     y, x = np.meshgrid(np.linspace(0, camera.height, 7), np.linspace(0, camera.width, 9), indexing="ij")
     xy = unproject(camera, np.stack([x, y], -1).reshape(-1, 2))
     rays = np.concatenate([xy, np.ones((len(xy), 1))], -1)
-    lens = project_jacobians(camera, rays)[2].reshape(-1, 9) @ free_columns(("k1", "k2"), True)
+    lens = np.concatenate(project_jacobians(camera, rays)[2])
+    lens = lens @ free_columns(("k1", "k2"), True, len(camera.distortion))
     x, y = xy.T
     spin = np.stack([np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1)], 1)
     turned = np.array([[camera.fx], [camera.fy]]) * (distortion_jacobian(camera.distortion, xy) @ spin)

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.camera.lens import distort, fold_radius_squared, project, rays_through
+from pipeline.camera.distortion import distort, fold_radius_squared, is_pinhole
+from pipeline.camera.lens import project, rays_through
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.reflection import incidence, solid_angle_gain
 from pipeline.types import Camera
@@ -135,7 +136,7 @@ def pixels_of(
     ray = [along * w[i] + back * axis[i] for i in range(3)]
     xy = np.stack([ray[0] / ray[2], ray[1] / ray[2]], -1)
     camera = mirror.camera
-    if np.any(camera.distortion):
+    if not is_pinhole(camera.distortion):
         fold = 0.98 * np.sqrt(fold_radius_squared(camera.distortion))
         if np.isfinite(fold):
             xy *= np.minimum(1, fold / np.maximum(np.hypot(xy[..., 0], xy[..., 1]), 1e-12))[..., None]

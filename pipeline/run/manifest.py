@@ -34,7 +34,9 @@ class CameraFacts(Strict):
     """Where the intrinsics come from: board photographs, given numbers (pixel origin of conventions), a camera.json."""
 
     calibration: list[str] = Field([], description="board photographs, files or globs")
-    given: dict[str, float | list[float]] | None = Field(None, description="width height fx fy cx cy [distortion]")
+    given: dict[str, float | list[float] | str] | None = Field(
+        None, description="width height fx fy cx cy [distortion [distortion_model: brown, rational or fisheye]]"
+    )
     file: str | None = Field(None, description="camera.json of a former build, same optics; relative to capture.toml")
 
     @model_validator(mode="after")
