@@ -124,6 +124,14 @@ class Composite(Params):
     half: bool = Field(False, description="store the factor on the plate (mul) as 16-bit floats")
 
 
+class Uncertainty(Params):
+    """How far each pixel can be trusted."""
+
+    pixels: int = Field(6000, ge=100, le=1_000_000, description="most pixels that are traced for a wrong light")
+    samples: int = Field(16, ge=4, le=4096, description="samples of each of them")
+    share: float = Field(0.01, ge=0, lt=1, description="of the variance: errors that stay below together are left out")
+
+
 class Evaluate(Params):
     """Error against truth, prediction without it."""
 
@@ -137,7 +145,7 @@ class Report(Params):
 KNOBS: dict[str, type[Params]] = {
     "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sfm": Sfm,
     "calibrate": Calibrate, "pose": Pose, "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance,
-    "render": Render, "composite": Composite, "evaluate": Evaluate, "report": Report,
+    "render": Render, "composite": Composite, "uncertainty": Uncertainty, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip
 
 # What each preset changes from the defaults above.

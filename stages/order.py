@@ -9,7 +9,7 @@ from pipeline.run.stage import Graph
 
 NAMES = (
     "ingest", "merge", "develop", "balance", "sfm", "calibrate", "pose", "probe", "lights", "plane", "reflectance",
-    "render", "composite", "evaluate", "report",
+    "render", "composite", "uncertainty", "evaluate", "report",
 )  # fmt: skip
 
 

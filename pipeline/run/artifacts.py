@@ -118,6 +118,19 @@ COMPOSITE = Artifact(
 DISPLAY = Artifact("display", "picture", "composite through the display transform", "", "display")
 PLATE_DISPLAY = Artifact("plate_display", "picture", "plate through the display transform", "", "display")
 
+UNCERTAINTY = Artifact(
+    "uncertainty",
+    "raster",
+    "standard uncertainty of the composite: sigma.RGB, its parts plate and render, and mode_k.RGB, the change per one "
+    "sigma of each shared error",
+    RADIANCE_UNIT,
+    ACESCG,
+)
+BUDGET = Artifact(
+    "budget", "json", "uncertainty by source, of pixels and of means, on objects and in shadows; what is not covered",
+    "1", type=dict[str, Any],
+)  # fmt: skip
+
 METRICS = Artifact("metrics", "json", "errors against truth; empty without truth", type=dict[str, Any])
 SELFCHECK = Artifact("selfcheck", "json", "predictions of what really stood there", type=dict[str, Any])
 ERROR_MAP = Artifact(

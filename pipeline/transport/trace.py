@@ -293,6 +293,16 @@ def centre_albedo(worlds: Worlds, rays: Rays) -> np.ndarray:
     return np.asarray(dr.select(on_local, albedo, mi.Color3f(0.0))).T.astype(float)
 
 
+def seen_points(worlds: Worlds, rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World points (N, 3) that the middles of pixels meet, and whether each lies on an object, on the local scene."""
+    import drjit as dr
+
+    mi = worlds.mi
+    centre = mi.Point2f(0.5) + dr.zeros(mi.Point2f, len(rays))
+    _, hit, on_object, on_local = camera_hits(worlds, rays, 1, centre, 0.0)
+    return np.asarray(hit.p).T.astype(float), np.asarray(on_object, bool), np.asarray(on_local, bool)
+
+
 def collect(
     mi: Any, count: int, obj: Any, lost: Any, gained: Any, without: Any, hit: Any, masks: tuple[Any, Any, Any]
 ) -> Samples:

@@ -1,0 +1,1 @@
+"""The error budget: what the stages' stated uncertainties make of the final pixels."""

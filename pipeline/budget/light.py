@@ -1,0 +1,194 @@
+"""How the light may be wrong: a few patterns of radiance, each of one standard uncertainty, that move independently.
+
+The map's stated variance has four parts with different shapes. What all texels share is *scale* (exposure between plate
+and probe, reflectance of the ball). An emitter's *flux* is its own. The rest of the sky is taken in six smooth *lobes*,
+the squares of the direction's components, which sum to 1: errors of texels are alike within `ALIKE` (the cells on which
+views are compared) and independent beyond. What no view saw moves as one, *unseen*. A wrong centre of the ball or a
+wrong pose of the camera turns the whole map: three *turns*. Which of them the composite can notice is bounded by the
+irradiance they carry to the plane and to the six sides of an object; those that together stay below a share of the
+variance are left out, and said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.camera.rigid import rotation_exp, skew
+from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
+from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance, resize_environment, total_energy
+from pipeline.types import BallFit, Emitter, Raster, View
+
+ALIKE_DEG = 2.8  # texels this near are taken to err alike; as wide as the cells of `pipeline.probes.combine`
+BOUND_MAP = (64, 128)  # of the maps whose irradiance bounds a pattern
+UNSEEN = 0.25  # coverage below which a texel was filled in, as the probe stage has it
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """One way for the light to be wrong, by one standard uncertainty.
+
+    ``source``: scale, flux, sky, unseen or turn. Either ``factor`` (3,), relative and the same in all directions; or
+    ``radiance`` (H, W, 3), what is added; or ``turn`` (3,), a rotation vector [rad] of the map in the world. ``bound``:
+    largest change of irradiance, relative, on the plane and on the six sides of a box.
+    """
+
+    name: str
+    source: str
+    bound: float
+    factor: np.ndarray | None = None
+    radiance: np.ndarray | None = None
+    turn: np.ndarray | None = None
+    emitter: Emitter | None = None  # whose flux it is
+
+
+def shared_sigma_of(environment: Raster) -> np.ndarray:
+    """(3,) relative standard uncertainty that all texels share; zeros for a map that does not say."""
+    stated = str(environment.attributes.get(SCALE_SIGMA, "0 0 0"))
+    return np.array([float(value) for value in stated.split()])
+
+
+def scale_patterns(covariance: np.ndarray) -> list[Pattern]:
+    """Independent patterns of a covariance (3, 3) of the logarithms of the three channels, the largest first."""
+    values, vectors = np.linalg.eigh(covariance)
+    found: list[Pattern] = []
+    for value, vector in sorted(zip(values, vectors.T), key=lambda pair: -pair[0]):
+        if value > 1e-6 * max(values[-1], 1e-300):
+            factor = np.sqrt(value) * vector * (1 if vector.sum() >= 0 else -1)
+            name = "scale" if not found else f"tint_{len(found)}"
+            found.append(Pattern(name, "scale", float(np.abs(factor).max()), factor=factor))
+    return found
+
+
+def scale_covariance(shared: np.ndarray, balance: np.ndarray | None) -> np.ndarray:
+    """(3, 3) of log scale: the balance's, and what else the map's ``shared`` (3,) holds, in all channels alike."""
+    known = np.zeros((3, 3)) if balance is None else np.asarray(balance)
+    rest = np.sqrt(np.maximum(shared**2 - np.diag(known), 0))
+    return known + np.outer(rest, rest)
+
+
+def own_sigma(environment: Raster, shared: np.ndarray) -> np.ndarray:
+    """(H, W, 3) standard uncertainty of each texel less what all share; zeros for a map without variance.
+
+    Where it is not finite the texel is a lower bound: no sigma covers it, and it is left to the evidence.
+    """
+    if "variance.R" not in environment.channels:
+        return np.zeros((*environment.shape, 3))
+    variance = environment.rgb("variance").astype(float) - (shared * environment.rgb()) ** 2
+    return np.sqrt(np.where(np.isfinite(variance), np.maximum(variance, 0), 0))
+
+
+def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
+    """One pattern per emitter: all its texels by the relative sigma of its irradiance, less what all light shares."""
+    rgb, found = environment.rgb().astype(float), []
+    for emitter in emitters:
+        texels = np.asarray(emitter.texels, int)
+        relative = np.divide(
+            emitter.irradiance_sigma, emitter.irradiance, out=np.zeros(3), where=np.asarray(emitter.irradiance) > 0
+        )
+        if emitter.evidence != "measured":  # there the texels' shared part was added, not squared, so it is in
+            relative = np.sqrt(np.maximum(relative**2 - shared**2, 0))
+        added = np.zeros_like(rgb)
+        added.reshape(-1, 3)[texels] = rgb.reshape(-1, 3)[texels] * relative
+        found.append(_radiance(f"flux_{emitter.name}", "flux", added, rgb, emitter))
+    return found
+
+
+def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
+    """The six lobes, and what nobody saw."""
+    rgb, sigma = environment.rgb().astype(float), own_sigma(environment, shared)
+    for emitter in emitters:
+        sigma.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0
+    height, width = environment.shape
+    directions, weight = latlong_directions(height, width), latlong_solid_angles(height, width)[..., None]
+    seen = environment.channels.get("seen", np.ones((height, width)))
+    unseen = np.where((seen < UNSEEN)[..., None], sigma, 0)
+    sigma = sigma - unseen
+    rows = max(1, round(height * ALIKE_DEG / 180))
+    found = []
+    for name, axis in zip(AXIS_NAMES, AXES, strict=True):
+        lobe = np.maximum(directions @ axis, 0)[..., None] ** 2
+        cells = _cells(weight * lobe * sigma, directions[..., 1], rows)
+        level = (weight * lobe * np.abs(rgb)).sum((0, 1))
+        relative = np.sqrt((cells**2).sum(0)) / np.maximum(level, 1e-300)
+        found.append(_radiance(f"sky_{name}", "sky", lobe * np.maximum(rgb, 0) * relative, rgb))
+    if unseen.any():
+        found.append(_radiance("unseen", "unseen", unseen, rgb))
+    return [pattern for pattern in found if pattern.bound > 0]
+
+
+def _cells(values: np.ndarray, height: np.ndarray, rows: int) -> np.ndarray:
+    """Sums (N, 3) of (H, W, 3) over cells of ``rows`` rows, as wide as high on the sphere."""
+    sums = []
+    for top in range(0, values.shape[0], rows):
+        part = values[top : top + rows].sum(0)
+        sine = float(np.sqrt(max(1 - np.mean(height[top : top + rows]) ** 2, 1e-4)))
+        columns = min(max(1, round(2 * rows / 2 / sine)), len(part))
+        sums.append(np.add.reduceat(part, np.arange(0, len(part), columns), 0))
+    return np.concatenate(sums)
+
+
+def direction_covariance(balls: dict[str, BallFit], views: dict[str, View]) -> np.ndarray:
+    """(3, 3) rad^2 of the map's rotation vector, world: pose of the ball's camera and where the ball was fitted.
+
+    A centre off by c across the line of sight turns every normal by c / R, every mirrored direction by twice that; the
+    camera's own rotation turns all. Views are averaged, so their covariances count by the square of their share.
+    """
+    total = np.zeros((3, 3))
+    for name, ball in balls.items():
+        rotation = views[name].world_from_camera[:3, :3]
+        sight = rotation @ (ball.centre_camera_m / np.linalg.norm(ball.centre_camera_m))
+        by_centre = 2 / ball.radius_m * skew(sight) @ rotation
+        total += by_centre @ ball.covariance @ by_centre.T + np.asarray(views[name].covariance)[:3, :3]
+    return total / max(len(balls), 1) ** 2
+
+
+def turn_patterns(environment: Raster, covariance: np.ndarray) -> list[Pattern]:
+    """Three independent turns of the map by its covariance (3, 3) rad^2."""
+    values, vectors = np.linalg.eigh(covariance)
+    small = resize_environment(np.maximum(environment.rgb(), 0), *BOUND_MAP)
+    before = irradiance(small, AXES)
+    found = []
+    for number, (value, vector) in enumerate(sorted(zip(values, vectors.T), key=lambda pair: -pair[0])):
+        if value > 0:
+            turn = np.sqrt(value) * vector
+            after = irradiance(small, AXES @ rotation_exp(turn))  # the light that came to R^T n now comes to n
+            found.append(Pattern(f"turn_{number}", "turn", relative_change(after - before, before), turn=turn))
+    return found
+
+
+def turned(rgb: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """A map (H, W, 3) turned by a rotation vector (3,) [rad], bilinear; its energy is kept exactly."""
+    height, width = rgb.shape[:2]
+    u, v = latlong_from_direction(latlong_directions(height, width) @ rotation_exp(turn))
+    column, row = u * width - 0.5, np.clip(v * height - 0.5, 0, height - 1)
+    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
+    across, down = (column - left)[..., None], (row - top)[..., None]
+    below = np.minimum(top + 1, height - 1)
+    upper = rgb[top, left % width] * (1 - across) + rgb[top, (left + 1) % width] * across
+    lower = rgb[below, left % width] * (1 - across) + rgb[below, (left + 1) % width] * across
+    result = upper * (1 - down) + lower * down
+    energy = total_energy(result)
+    return np.asarray(result * np.divide(total_energy(rgb), energy, out=np.ones(3), where=energy > 0))
+
+
+def relative_change(change: np.ndarray, level: np.ndarray) -> float:
+    """Largest ratio of the norms over RGB of irradiances (N, 3)."""
+    before = np.linalg.norm(level, axis=1)
+    return float(np.max(np.linalg.norm(change, axis=1) / np.maximum(before, 1e-300)))
+
+
+def _radiance(name: str, source: str, added: np.ndarray, rgb: np.ndarray, emitter: Emitter | None = None) -> Pattern:
+    small, level = (resize_environment(values, *BOUND_MAP) for values in (added, np.maximum(rgb, 0)))
+    bound = relative_change(irradiance(small, AXES), irradiance(level, AXES))
+    return Pattern(name, source, bound, radiance=added, emitter=emitter)
+
+
+def worth_following(patterns: list[Pattern], share: float) -> tuple[list[Pattern], list[Pattern]]:
+    """Those that are followed to the pixels, and those that together stay below a ``share`` of the squared bounds."""
+    ordered = sorted(patterns, key=lambda pattern: pattern.bound)
+    squares = np.cumsum([pattern.bound**2 for pattern in ordered])
+    few = int(np.searchsorted(squares, share * squares[-1])) if len(ordered) and squares[-1] > 0 else len(ordered)
+    left = {pattern.name for pattern in ordered[:few]}
+    return [p for p in patterns if p.name not in left], [p for p in patterns if p.name in left]

@@ -1,0 +1,272 @@
+"""How far each pixel can be trusted: the stated uncertainties of all stages, carried to the composite.
+
+Independent per pixel: the plate's noise and what sampling and denoising left of the render. Shared: a few modes, each
+exported as the change of the composite per standard uncertainty (scale of the light, flux of each lamp, the sky in
+lobes, turns of the map, pose and lens). Light enters linearly and is rendered once per pattern, few pixels, few samples
+(`pipeline.budget.response`); patterns too weak to matter are left out and said. ``sigma`` is relative to the plate's
+own scale: what plate and light share (the capture's one unit) is no error here. Limits: first order; reflectance of the
+objects is taken as wished; what no stage states an uncertainty for is named in ``not_covered``, in the stage's words.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.budget import geometry, light, pixels
+from pipeline.budget.response import STEP_RAD, Grid, Layers, Response, Seen, points_on, rendered
+from pipeline.conventions import ACESCG
+from pipeline.image.colour import luminance
+from pipeline.light.environment import irradiance
+from pipeline.run import artifacts as A
+from pipeline.run.formats import read_mask
+from pipeline.run.stage import Stage
+from pipeline.transport import differential as d
+from pipeline.transport.placing import place_objects
+from pipeline.transport.scene import Worlds, build_worlds
+from pipeline.transport.trace import LensRays
+from pipeline.types import Balance, BallFit, Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
+from stages import knobs
+
+DEPTH = 4  # vertices of a path: what more bounces would change of a ratio is of second order
+FOLLOWED_CHANGE = 0.01  # of LS_noobj: a change of light that is worth a ray of the budget
+
+
+def compute(
+    wishes: dict[str, Any], camera: Camera, views: dict[str, View], photographs: dict[str, Raster],
+    balance: dict[str, Balance], balls: dict[str, BallFit], environment: Raster, emitters: list[Emitter], plane: Plane,
+    albedo: Raster, surface: Surface, local_proxies: list[Proxy], occluders: list[Occluder], layers: Raster,
+    composite: Raster, records: dict[str, Any], params: knobs.Uncertainty,
+) -> Result:  # fmt: skip
+    """Sigma, its parts and the shared modes, plate-sized, ACEScg; and the budget by source."""
+    plate = photographs["plate"]
+    mul, free = composite.rgb("mul"), in_sight(occluders, plate.shape)
+    on_lost, on_gained = slopes(layers, plate, records, free)
+    size = np.abs(layers.rgb("lost")) + np.abs(layers.rgb("gained"))
+    share = np.divide(np.abs(layers.rgb("lost")), size, out=np.full(size.shape, 0.5), where=size > 0)
+    own = {
+        "plate": pixels.plate_variance(mul, plate.rgb("variance")),
+        "render": pixels.render_variance(
+            share * on_lost + (1 - share) * on_gained, layers.rgb("without"), composite.rgb("obj"),
+            layers["noise.change"], layers["noise.obj"] * free,
+        ),
+    }  # fmt: skip
+    changed = (size > FOLLOWED_CHANGE * layers.rgb("without")).any(-1) & (layers["ground"] > 0)
+    wanted = ((layers["obj.A"] > 0) | changed) & (free > 0)
+    modes: list[pixels.Mode] = []
+    window = (slice(0, 0), slice(0, 0))
+    evidence: list[dict[str, Any]] = []
+    numbers: dict[str, Any] = {}
+    if wishes["object"] and wanted.any():
+        grid = Grid.over(wanted, params.pixels)
+        window = grid.window
+        studio = Studio(
+            wishes, camera, views["plate"], environment, emitters, plane, albedo, surface, local_proxies, occluders,
+            grid, params.samples, settings(records, "render", "materials", "conserving"),
+        )  # fmt: skip
+        full = Layers(
+            layers.rgb("lost")[window], layers.rgb("gained")[window], composite.rgb("obj")[window], on_lost[window],
+            on_gained[window],
+        )  # fmt: skip
+        followed, left = patterns(environment, emitters, balance, balls, views, params.share)
+        modes = light_modes(studio, full, followed)
+        modes += geometry_modes(studio, composite, plate, params.share)
+        numbers = {"step_px": grid.step, "traced_px": int(grid.chosen.sum()), "followed": [p.name for p in followed]}
+        evidence = reasons(followed, left, params.share)
+    picture = composite.rgb()
+    variance = pixels.total_variance(list(own.values()), modes, window)
+    fall = pixels.waterfall(picture, plate.rgb(), composite["obj.A"], own, modes, window)
+    unknown = int((~np.isfinite(variance)).any(-1).sum())
+    numbers |= {"unknown_px": unknown, "modes": {mode.name: mode.source for mode in modes}}
+    numbers |= {f"{region}_sigma_rel": part["pixel_rel"]["total"] for region, part in fall.items()}
+    numbers |= {f"{region}_mean_sigma_rel": part["mean_rel"]["total"] for region, part in fall.items()}
+    parts = {"sigma": np.sqrt(variance), **{name: np.sqrt(part) for name, part in own.items()}}
+    for mode in modes:
+        parts[f"mode_{mode.name}"] = np.zeros(picture.shape, np.float32)
+        parts[f"mode_{mode.name}"][window] = mode.change
+    channels = {name: v for layer, rgb in parts.items() for name, v in Raster.split(rgb, layer).items()}
+    header = {"insitu:modes": ",".join(mode.name for mode in modes), "insitu:sigma": SIGMA}
+    raster = Raster(pixels.stored(channels, float(np.median(plate.rgb()))), ACESCG, header)
+    uncovered = not_covered(records)
+    warnings = [f"uncertainty: {unknown} px have none, as the plate is clipped there"] if unknown else []
+    warnings += [f"{one.name} is a lower bound: no sigma covers what it lacks" for one in emitters if one.lower_bound]
+    outputs = {"uncertainty": raster, "budget": {"regions": fall, "not_covered": uncovered}}
+    return Result(outputs, numbers, warnings, evidence)
+
+
+SIGMA = "sigma^2 = plate^2 + render^2 + sum(mode^2); modes are signed, independent of each other, one sigma each"
+
+
+class Studio:
+    """Worlds of the scene under any light, and renders of the grid's pixels in them."""
+
+    def __init__(
+        self, wishes: dict[str, Any], camera: Camera, view: View, environment: Raster, emitters: list[Emitter],
+        plane: Plane, albedo: Raster, surface: Surface, proxies: list[Proxy], occluders: list[Occluder], grid: Grid,
+        samples: int, materials: str,
+    ) -> None:  # fmt: skip
+        self.camera, self.view, self.grid, self.samples = camera, view, grid, samples
+        self.plane, self.albedo, self.surface = plane, albedo.rgb(), surface
+        self.proxies, self.occluders, self.emitters = proxies, occluders, emitters
+        self.rgb = np.asarray(environment.rgb(), float)
+        self.irradiance = self.upward(self.rgb)
+        self.rays = LensRays(camera, view.world_from_camera)
+        white = float(luminance(self.irradiance)) / np.pi
+        self.lit = place_objects(wishes, plane, white, materials)[0]
+        self.dark = place_objects(wishes, plane, 0.0, materials)[0]  # without what they send out themselves
+
+    def upward(self, rgb: np.ndarray) -> np.ndarray:
+        """Irradiance (3,) on the plane."""
+        return np.asarray(irradiance(rgb, self.plane.normal[None])[0])
+
+    def worlds(self, rgb: np.ndarray, emitters: list[Emitter], black: bool = False) -> Worlds:
+        """The scene under a map; without the ground's and proxies' light when ``black``."""
+        ground = np.zeros(3) if black else self.albedo
+        proxies = [p.model_copy(update={"albedo": np.zeros(3)}) for p in self.proxies] if black else self.proxies
+        return build_worlds(self.plane, ground, rgb, self.dark, proxies, emitters, self.surface, self.occluders)
+
+    def seen(self, rgb: np.ndarray, emitters: list[Emitter], black: bool = False) -> Seen:
+        """A render."""
+        return rendered(self.worlds(rgb, emitters, black), self.rays, self.grid, self.samples, DEPTH, seed=1)
+
+
+def settings(records: dict[str, Any], stage: str, knob: str, otherwise: Any) -> Any:
+    """What an earlier stage ran with."""
+    return (records.get(stage, {}).get("params") or {}).get(knob, otherwise)
+
+
+def in_sight(occluders: list[Occluder], shape: tuple[int, int]) -> np.ndarray:
+    """(H, W) share of each pixel that no masked real thing covers, as in composite."""
+    free = np.ones(shape)
+    for occluder in occluders:
+        if occluder.mask_file is not None:
+            free *= 1 - read_mask(Path(occluder.mask_file))
+    return free
+
+
+def slopes(layers: Raster, plate: Raster, records: dict[str, Any], free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the composite makes of a unit of lost and of added light, each (H, W, 3), by the rule that it followed."""
+    parts = {name: layers.rgb(name) for name in ("obj", "lost", "gained", "without", "variance")}
+    change = d.Change(**parts, alpha=layers["obj.A"], ground=layers["ground"])
+    kind = settings(records, "composite", "kind", "auto")
+    if kind == "auto":
+        rule = d.chosen(change, plate.rgb(), plate.rgb("variance"))
+    else:
+        rule = {"additive": d.additive, "ratio": d.ratio}[kind](change)
+    model = change.model
+    k = np.divide(plate.rgb(), model, out=np.ones(model.shape), where=model > 0)
+    found = []
+    for t, gain in ((rule.lost_share, 1.0), (rule.gained_share, rule.gain)):
+        found.append((t * k + (1 - t) * gain) * free[..., None])
+    return found[0], found[1]
+
+
+def patterns(
+    environment: Raster, emitters: list[Emitter], balance: dict[str, Balance], balls: dict[str, BallFit],
+    views: dict[str, View], share: float,
+) -> tuple[list[light.Pattern], list[light.Pattern]]:  # fmt: skip
+    """Ways for the light to be wrong that are followed to the pixels, and those too weak to matter."""
+    shared = light.shared_sigma_of(environment)
+    tied = next((balance[name].covariance for name in [*balls, *balance] if name in balance), None)
+    found = light.scale_patterns(light.scale_covariance(shared, tied))
+    found += light.flux_patterns(environment, emitters, shared) + light.sky_patterns(environment, emitters, shared)
+    if balls:
+        found += light.turn_patterns(environment, light.direction_covariance(balls, views))
+    return light.worth_following(found, share)
+
+
+def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> list[pixels.Mode]:
+    """What each pattern makes of the composite."""
+    if not followed:
+        return []
+    whole = studio.seen(studio.rgb, studio.emitters)
+    response = Response(studio.grid, full, whole, studio.seen(studio.rgb, studio.emitters, black=True))
+    modes = []
+    for pattern in followed:
+        if pattern.factor is not None:
+            change = response.of_factor(pattern.factor)
+        elif pattern.radiance is not None:
+            seen = studio.seen(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
+            change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
+        else:
+            assert pattern.turn is not None
+            angle = float(np.linalg.norm(pattern.turn))
+            step = pattern.turn * STEP_RAD / angle
+            moved = light.turned(studio.rgb, step)
+            apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
+            share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
+            change = angle / STEP_RAD * response.of_turn(apart, share)
+        modes.append(pixels.Mode(pattern.name, pattern.source, change))
+    return modes
+
+
+def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
+    """The emitters on the texels that a turned map has them on."""
+    moved = []
+    for emitter in studio.emitters:
+        alone = np.zeros(studio.rgb.shape)
+        alone.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 1.0
+        texels = np.flatnonzero(light.turned(alone, turn)[..., 0] > 0.5)
+        moved.append(emitter.model_copy(update={"texels": texels}))
+    return moved
+
+
+def geometry_modes(studio: Studio, composite: Raster, plate: Raster, share: float) -> list[pixels.Mode]:
+    """What pose and lens make of the composite: objects and shadows are drawn elsewhere, the plate stays."""
+    grid, window = studio.grid, studio.grid.window
+    points, px, on_object = points_on(studio.worlds(studio.rgb, []), studio.rays, grid)
+    if not len(points):
+        return []
+    alpha = composite["obj.A"][window][..., None]
+    shade = composite.rgb("mul")[window] - 1 + alpha
+    obj, add, ground = composite.rgb("obj")[window], composite.rgb("add")[window], plate.rgb()[window]
+    modes = []
+    for number, field in enumerate(geometry.fields(studio.camera, studio.view, points, px, on_object, share)):
+        by_object, by_ground = geometry.shifts(field, grid.shape, window)
+        change = geometry.moved_by(obj, by_object) - ground * geometry.moved_by(alpha, by_object)
+        change += ground * geometry.moved_by(shade, by_ground) + geometry.moved_by(add, by_ground)
+        modes.append(pixels.Mode(f"pose_{number}", "pose", change))
+    return modes
+
+
+def reasons(followed: list[light.Pattern], left: list[light.Pattern], share: float) -> list[dict[str, Any]]:
+    """Which patterns of the light were followed, and why the others were not."""
+    rows = [
+        {
+            "term": f"uncertain light: {pattern.name}",
+            "modelled": kept,
+            "because": f"it may change irradiance by {pattern.bound:.2%}"
+            + ("" if kept else f"; all that are left out stay below {share:.0%} of the squared bounds"),
+            "could_cost": "nothing: it is a mode" if kept else f"{pattern.bound:.2%} of the light on a surface",
+        }
+        for kept, some in ((True, followed), (False, left))
+        for pattern in some
+    ]
+    return rows
+
+
+def not_covered(records: dict[str, Any]) -> list[dict[str, str]]:
+    """What earlier stages did not model and what they say that it could cost: no sigma holds it."""
+    found = []
+    for stage, record in records.items():
+        for row in record.get("evidence") or []:
+            cost = str(row.get("could_cost", ""))
+            if row.get("modelled") is False and cost and not cost.startswith(("nothing", "0 ")):
+                found.append({"stage": stage, "term": str(row["term"]), "could_cost": cost})
+    return found
+
+
+STAGE = Stage(
+    "uncertainty",
+    compute,
+    knobs.Uncertainty,
+    inputs={
+        "wishes": A.WISHES, "camera": A.CAMERA, "views": A.VIEWS, "photographs": A.PHOTOGRAPHS, "balance": A.BALANCE,
+        "balls": A.BALLS, "environment": A.ENVIRONMENT, "emitters": A.EMITTERS, "plane": A.PLANE, "albedo": A.ALBEDO,
+        "surface": A.SURFACE, "local_proxies": A.LOCAL_PROXIES, "occluders": A.OCCLUDERS, "layers": A.LAYERS,
+        "composite": A.COMPOSITE, "records": A.RECORDS,
+    },
+    outputs={"uncertainty": A.UNCERTAINTY, "budget": A.BUDGET},
+)  # fmt: skip
