@@ -7,7 +7,9 @@ lens; pixels that the objects cover or change get most of the samples. In the sh
 random numbers that both worlds share; it is added to the plate as photographed, whose own noise is part of the
 photographed surface. The stated noise is measured from independent halves.
 
-Imports nothing that estimates. Limits: the room is infinitely far away, no depth of field, no vignetting, no flare.
+What the estimators do not model can be added on purpose ([leave] of the scene file): veiling glare, dents of the ball,
+curled sheets, a clear coat. Imports nothing that estimates. Limits: no depth of field, no vignetting, no ghosts of the
+lens.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 from pipeline.run.errors import ManifestError, ToolError
 from pipeline.run.formats import write_bytes
 from pipeline.simulation import capture, shapes
+from pipeline.simulation.leaving import glare
 from pipeline.simulation.lens import Lens, aim, blur, look_at
 from pipeline.simulation.photograph import (
     Measure,
@@ -37,6 +40,7 @@ from pipeline.simulation.photograph import (
 )
 from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts, load_scene
 from pipeline.simulation.spectral import Size, main, twin
+from pipeline.simulation.thrown import SMALL_DEG, seen_on_table, thrown_irradiance
 from pipeline.simulation.world import Place
 
 SMOOTHING_PX = 5.0  # of the light that the ball throws
@@ -65,9 +69,17 @@ class Studio:
         target = view.target_m or self.scene.plate.target_m
         return look_at(np.array(position), np.array(target))
 
-    def radiance(self, *parts: dict[str, Any]) -> Measure:
+    def radiance(self, *parts: dict[str, Any], small_lamps: bool = True) -> Measure:
         """Path-traced radiance of the place with these parts in it."""
-        return path_radiance(self.mi, self.place.load(*parts), self.scene.sampling.depth)
+        return path_radiance(self.mi, self.place.load(*parts, small_lamps=small_lamps), self.scene.sampling.depth)
+
+    def glared(self, picture: np.ndarray) -> np.ndarray:
+        """What the lens' glare makes of a picture (H, W, 3)."""
+        return glare(picture, self.scene.leave.glare, self.scene.leave.glare_radius_px)
+
+    def sharp(self, raw: np.ndarray) -> np.ndarray:
+        """A photograph (H, W, 3) after blur and glare of the lens."""
+        return self.glared(blur(raw, self.scene.camera.blur_sigma_px))
 
     def photograph(self, measure: Measure, pose: np.ndarray, samples: int, seed: int) -> np.ndarray:
         """(H, W, K) before the lens' blur."""
@@ -99,6 +111,7 @@ def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> No
     take_views(studio, shoot, progress)
     pictures = {view.name: ball_picture(studio, view, progress) for view in scene.ball_view}
     pictures["plate"], noise = plate_truth(studio, out, progress)
+    pictures |= turned_plates(studio, progress)
     capture.take_brackets(shoot, pictures)
     surface_truth(studio, out, views["plate"], progress)
     record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, noise)
@@ -125,7 +138,7 @@ def take_calibration(studio: Studio, shoot: capture.Shoot, progress: Callable[[s
         progress(f"board photograph {number + 1} of {len(studio.scene.calibration)}")
         pose = board_pose(studio.scene, studio.lens, photo)
         raw = studio.photograph(measure, pose, studio.scene.sampling.calibration, 900_000 + 1000 * number)
-        data = capture.srgb_jpeg(blur(raw, studio.scene.camera.blur_sigma_px), shoot.sensor, number)
+        data = capture.srgb_jpeg(studio.sharp(raw), shoot.sensor, number)
         write_bytes(shoot.out / "calibration" / f"calib_{number:02d}.jpg", data)
 
 
@@ -137,7 +150,7 @@ def take_views(studio: Studio, shoot: capture.Shoot, progress: Callable[[str], N
         progress(f"photograph {number + 1} of {len(scene.view)}")
         raw = studio.photograph(measure, studio.pose(view), scene.sampling.calibration, 800_000 + 1000 * number)
         exif = capture.lens_exif(scene.camera)
-        data = capture.srgb_jpeg(blur(raw, scene.camera.blur_sigma_px), shoot.sensor, 1000 + number, "view", exif)
+        data = capture.srgb_jpeg(studio.sharp(raw), shoot.sensor, 1000 + number, "view", exif)
         write_bytes(shoot.out / "views" / f"{view.name}.jpg", data)
 
 
@@ -146,29 +159,47 @@ def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None
 
     Light that the ball throws onto the table is hard to sample: it would speckle the picture. It is smooth, since the
     ball is convex, so it is found as the difference from a black ball under the same random numbers and smoothed, as
-    irradiance on the table and as radiance in the ball; its energy is kept.
+    irradiance on each surface and as radiance in the ball; its energy is kept. What it throws of small lamps is traced
+    from them (`pipeline.simulation.thrown`).
     """
     progress(f"{view.name}: mirror ball")
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
     pose = studio.pose(view)
     people = place.photographer(pose)
     seed = 100_000 * (2 + [v.name for v in scene.ball_view].index(view.name))
-    mirror = studio.photograph(studio.radiance(people, place.ball()), pose, sampling.ball, seed)
+    small = [lamp for lamp in scene.light.lamp if lamp.diameter_deg < SMALL_DEG]
+    some = max(16, sampling.ball // 4) if small else sampling.ball  # what is smoothed needs fewer
+    mirror = studio.photograph(studio.radiance(people, place.ball(), small_lamps=not small), pose, some, seed)
     dark = place.load(people, place.ball(black=True))
     ball = next(shape for shape in dark.shapes() if shape.id() == "ball")
-    base = mirrored_radiance(studio.mi, dark, sampling.depth, ball, scene.ball.reflectance)
-    black = studio.photograph(base, pose, sampling.ball, seed)
-    cover = studio.photograph(first_hit(studio.mi, dark, [ball]), pose, sampling.pass_samples, seed)
-    surfaces = surface_albedo(studio.mi, dark, list(place.table_and_prints().values()))
-    albedo = studio.photograph(surfaces, pose, sampling.pass_samples, seed)
-    thrown = spread_light(mirror - black, albedo, cover)
-    return blur(black + thrown, scene.camera.blur_sigma_px)
+
+    def behind(world: Any, black: Any, samples: int) -> np.ndarray:
+        base = mirrored_radiance(studio.mi, world, sampling.depth, black, scene.ball.reflectance)
+        return studio.photograph(base, pose, samples, seed)
+
+    def seen(measure: Measure) -> np.ndarray:
+        return studio.photograph(measure, pose, sampling.pass_samples, seed)
+
+    black = without = behind(dark, ball, sampling.ball)
+    if small:
+        dim = place.load(people, place.ball(black=True), small_lamps=False)
+        without = behind(dim, next(shape for shape in dim.shapes() if shape.id() == "ball"), some)
+    surfaces = [list(place.table_and_prints().values()), *([box] for box in place.boxes().values())]
+    albedo = [seen(surface_albedo(studio.mi, dark, shapes)) for shapes in surfaces]
+    thrown = spread_light(mirror - without, albedo, seen(first_hit(studio.mi, dark, [ball])))
+    for number, lamp in enumerate(small):
+        radius, reflectance = scene.ball.diameter_m / 2, scene.ball.reflectance
+        light = thrown_irradiance(lamp, scene.light.scale, place.ball_centre, radius, reflectance, scene.seed + number)
+        thrown = thrown + seen(
+            seen_on_table(studio.mi, dark, light, place.ball_centre, surfaces[0], ball, reflectance)
+        )  # fmt: skip
+    return studio.sharp(black + thrown)
 
 
-def spread_light(light: np.ndarray, albedo: np.ndarray, cover: np.ndarray) -> np.ndarray:
-    """Smooth the light (H, W, 3) thrown by the ball within the table and within the ball.
+def spread_light(light: np.ndarray, albedo: list[np.ndarray], cover: np.ndarray) -> np.ndarray:
+    """Smooth the light (H, W, 3) thrown by the ball within each surface and within the ball.
 
-    ``albedo``: (H, W, 4), of the surfaces times their coverage, and their coverage; ``cover``: (H, W, 1) of the ball.
+    ``albedo``: (H, W, 4) of each surface, times its coverage, and its coverage; ``cover``: (H, W, 1) of the ball.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -177,9 +208,11 @@ def spread_light(light: np.ndarray, albedo: np.ndarray, cover: np.ndarray) -> np
         sums = gaussian_filter(values * weight[..., None], (SMOOTHING_PX, SMOOTHING_PX, 0))
         return sums / np.maximum(near, 1e-9)[..., None] * (near > 1e-6)[..., None]
 
-    table = (albedo[..., 3] > 0.999).astype(float)
-    irradiance = within(light / np.maximum(albedo[..., :3], 1e-3), table)
-    return albedo[..., :3] * irradiance + cover * within(light, (cover[..., 0] > 0.999).astype(float))
+    spread = cover * within(light, (cover[..., 0] > 0.999).astype(float))
+    for surface in albedo:
+        irradiance = within(light / np.maximum(surface[..., :3], 1e-3), (surface[..., 3] > 0.999).astype(float))
+        spread = surface[..., :3] * irradiance + spread
+    return np.asarray(spread)
 
 
 def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> tuple[np.ndarray, dict[str, float]]:
@@ -208,13 +241,29 @@ def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> t
     found = measured_noise(pictures, blur(half, sigma), coverage.sum(-1), region)
     truth, finer = resampled_change(studio, (filled, plate), pictures, coverage.sum(-1), progress)
     for name, pixels in (("plate", pictures["plate"]), ("with_objects", truth)):
-        capture.write_picture(out / "truth" / f"{name}.exr", pixels)
+        capture.write_picture(out / "truth" / f"{name}.exr", studio.glared(pixels))
     names = [model.name for model in scene.object]
     capture.write_layers(
         out / "truth" / "coverage.exr", {n: coverage[..., i] for i, n in enumerate(names)}, studio.shape
     )
     spent = {"spp": sampling.object, "spp_shadow": sampling.region, "spp_else": sampling.plate}
-    return pictures["plate"], found | spent | finer
+    return studio.glared(pictures["plate"]), found | spent | finer
+
+
+def turned_plates(studio: Studio, progress: Callable[[str], None]) -> dict[str, np.ndarray]:
+    """Plate frames (H, W, 3), "plate_0" and so on, of a hand that turned the camera between them; none on a tripod."""
+    made: dict[str, np.ndarray] = {}
+    for number, (right, up) in enumerate(studio.scene.bracket.plate_turn_deg):
+        if right or up:
+            progress(f"plate frame {number}, turned by {right} and {up} degrees")
+            ideal = (-float(np.tan(np.radians(right))), float(np.tan(np.radians(up))))  # where the old axis is seen
+            pose = aim(studio.pose(studio.scene.plate), ideal)
+            people = studio.place.photographer(studio.pose(studio.scene.plate))
+            world = studio.place.load(people, prints=not studio.scene.bare_plate)
+            measure = path_radiance(studio.mi, world, studio.scene.sampling.depth)
+            raw = studio.photograph(measure, pose, studio.scene.sampling.plate, 40_000 + 1000 * number)
+            made[f"plate_{number}"] = studio.sharp(raw)
+    return made
 
 
 def changed_region(raw: dict[str, np.ndarray], coverage: np.ndarray, sigma: float, threshold: float) -> np.ndarray:

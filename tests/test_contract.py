@@ -52,6 +52,7 @@ BRIDGES = {
         "pipeline/transport/trace.py",
         "pipeline/transport/variant.py",  # after mitsuba has chosen its LLVM
         "pipeline/simulation/photograph.py",
+        "pipeline/simulation/thrown.py",
         "pipeline/simulation/twin_world.py",
     },
     "pycolmap": {"pipeline/camera/colmap_bridge.py"},

@@ -68,10 +68,13 @@ class Shoot:
 
     def take(self, name: str, acescg: np.ndarray, third: int) -> None:
         """Expose one frame of a radiance picture (H, W, 3) and write ``name``. Raises ManifestError off the ladder."""
+        wrong = {one.file: one.factor for one in self.scene.bracket.wrong_label}
         try:
             time_s, label = shutter(third)
         except ValueError as error:
             raise ManifestError(f"{name}: {error}; change light.scale or camera.fnumber") from error
+        if name in wrong:
+            label = (label * Fraction(wrong[name])).limit_denominator(10000)
         number = len(self.exposures)
         mosaic = self.sensor.expose(self.to_camera(acescg), self.gain(time_s), time_s, number)
         write_bytes(self.out / name, dng_bytes(mosaic, self._facts(label, number)))
@@ -90,17 +93,16 @@ class Shoot:
 
 
 def take_brackets(shoot: Shoot, pictures: dict[str, np.ndarray]) -> None:
-    """All RAW frames of the plate and the ball views."""
-    bracket = shoot.scene.bracket
+    """All RAW frames of the plate and the ball views; ``pictures`` has "plate", the balls, and turned "plate_0" ..."""
+    bracket, frames = shoot.scene.bracket, shoot.scene.frames()
     base = shoot.metered([pictures["plate"]], bracket.plate_fill)
-    for ev in bracket.plate_ev:
-        shoot.take(f"plate/plate_ev{ev:+d}.dng".replace("+0", "0"), pictures["plate"], base - 3 * ev)
+    for number, (file, ev) in enumerate(zip(frames["plate"], bracket.plate_ev, strict=True)):
+        shoot.take(file, pictures.get(f"plate_{number}", pictures["plate"]), base - 3 * ev)
     names = [view.name for view in shoot.scene.ball_view]
     shortest = shoot.metered([pictures[name] for name in names], bracket.ball_fill)
     for name in names:
-        for frame in range(bracket.ball_frames):
-            third = shortest - 3 * bracket.ball_step_ev * frame
-            shoot.take(f"{name}/{name}_{frame + 1}.dng", pictures[name], third)
+        for number, file in enumerate(frames[name]):
+            shoot.take(file, pictures[name], shortest - 3 * bracket.ball_step_ev * number)
 
 
 def srgb_jpeg(acescg: np.ndarray, sensor: Sensor, seed: int, kind: str = "calibration", exif: bytes = b"") -> bytes:
@@ -182,6 +184,13 @@ def capture_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]
         yield "[views]", {"files": ["views/*.jpg"]}
         for name in ["plate", *[view.name for view in scene.ball_view if view.position_m is not None]]:
             yield "[[pose]]", {"view": name, "route": "colmap"}
+    for box in scene.box:
+        if box.stated:
+            (x, z), height = box.position_m, box.size_m[1]
+            measures = {"centre_m": (x, height / 2, z), "size_m": box.size_m, "yaw_deg": box.yaw_deg}
+            yield "[[proxy]]", {"name": box.name, **measures}
+    if scene.room is not None and scene.room.stated:
+        yield "[room]", {"centre_m": scene.room.centre_m, "size_m": scene.room.size_m}
     if scene.view and not scene.calibration:
         return
     if scene.calibration:
@@ -257,6 +266,7 @@ def truth_record(
             "hot_pixels": [{"row": int(r), "column": int(c), "e_per_s": float(e)} for r, c, e in hot],
         },
         "exposures": shoot.exposures,
+        **({"leaves": leaves} if (leaves := scene.leave.model_dump(exclude_defaults=True)) else {}),
         "noise": noise,
     }
 

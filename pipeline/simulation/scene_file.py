@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from pipeline.run.errors import ManifestError
-from pipeline.run.manifest import BoardFacts, Rgb, Strict, load_toml, problems_of
+from pipeline.run.manifest import BoardFacts, Rgb, Share, Strict, load_toml, problems_of
 
 Point = tuple[float, float, float]
 Span = tuple[float, float]
@@ -81,6 +81,25 @@ class LightFacts(Strict):
     map_width: int = Field(2048, ge=16, le=8192, multiple_of=2)
 
 
+class NearLampModel(Strict):
+    """A glowing ball at a finite distance; its radiance is multiplied by ``light.scale``."""
+
+    position_m: Point
+    diameter_m: float = Field(gt=0)
+    radiance: Rgb
+
+
+class RoomModel(Strict):
+    """A closed box of matt walls around everything, in place of the distant light."""
+
+    centre_m: Point
+    size_m: Point
+    wall: Rgb
+    ceiling: Rgb
+    floor: Rgb
+    stated: bool = Field(True, description="capture.toml has its measures as [room]")
+
+
 class TableFacts(Strict):
     """The table top, y = 0: procedural wood or terrazzo, diffuse, or glossy by the glTF material with a roughness."""
 
@@ -112,13 +131,15 @@ class MarkerModel(Strict):
 
 
 class BoxModel(Strict):
-    """A real box that stands on the table in every photograph, speckled."""
+    """A real box (or, thin, a wall) that stands on the table in every photograph, speckled."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     position_m: Span = Field(description="x, z of its middle")
     size_m: Point = Field(description="along its x, y, z")
     yaw_deg: float = 0.0
     albedo: Rgb
+    contrast: float = Field(0.9, ge=0, le=2)
+    stated: bool = Field(False, description="capture.toml has it as a [[proxy]], without its albedo")
 
 
 class BallModel(Strict):
@@ -183,15 +204,49 @@ class BoardPhoto(Strict):
     at: Span = (0.5, 0.5)
 
 
+class WrongLabel(Strict):
+    """A frame whose EXIF exposure time is that of its true one times a factor."""
+
+    file: str
+    factor: float = Field(gt=0)
+
+
 class BracketFacts(Strict):
-    """Exposures: the fullest channel of the plate's middle frame and of the shortest ball frame."""
+    """Exposures: the fullest channel of the plate's middle frame and of the shortest ball frame.
+
+    A ``ball_fill`` above 1 lets the brightest light clip in every frame. ``plate_turn_deg``: the plate is held by hand,
+    and each frame is turned to the right and upwards by so much.
+    """
 
     plate_ev: list[int] = Field([-2, 0, 2], min_length=1)
     plate_fill: float = Field(0.85, gt=0, le=1)
     ball_frames: int = Field(6, ge=1, le=12)
     ball_step_ev: int = Field(2, ge=1, le=4)
-    ball_fill: float = Field(0.8, gt=0, le=1)
+    ball_fill: float = Field(0.8, gt=0, le=1e5)
+    plate_turn_deg: list[Span] = Field([])
+    wrong_label: list[WrongLabel] = Field([])
     started: str = Field("2026:03:14 10:00:00", description="EXIF time of the first frame")
+
+
+class DentFacts(Strict):
+    """A dent of the mirror ball: a Gaussian of the angle from its middle. Directions as of the light."""
+
+    azimuth_deg: float
+    elevation_deg: float = Field(ge=-90, le=90)
+    depth_m: float = Field(description="how far its middle lies inside; negative: a bump")
+    sigma_deg: float = Field(gt=1, lt=60)
+
+
+class LeaveFacts(Strict):
+    """What leaves the model class of the estimators on purpose; nothing of it is written into capture.toml."""
+
+    glare: Share = Field(0.0, lt=0.5, description="share of the light that lens and body spread over the picture")
+    glare_radius_px: float = Field(60.0, gt=0, description="of the bell (1 + (r / radius)^2)^-3/2 that it is spread by")
+    curl_radius_m: float | None = Field(None, gt=0.05, description="printed sheets bend up along x on this radius")
+    dent: list[DentFacts] = Field([])
+    table_coat: float | None = Field(
+        None, gt=0.01, le=1, description="alpha of a clear coat (index 1.5) over the table, with the light within it"
+    )
 
 
 class SamplingFacts(Strict):
@@ -235,6 +290,8 @@ class SimulatedScene(Strict):
     marker: list[MarkerModel] = Field([], description="instead of a board")
     bare_plate: bool = Field(False, description="board and markers are taken away before the plate")
     box: list[BoxModel] = Field([])
+    near_lamp: list[NearLampModel] = Field([])
+    room: RoomModel | None = None
     ball: BallModel
     plate: ViewFacts
     ball_view: list[ViewFacts] = Field(min_length=1)
@@ -244,7 +301,15 @@ class SimulatedScene(Strict):
         [], description="without them capture.toml gives the intrinsics, or leaves them to the further photographs"
     )
     bracket: BracketFacts = BracketFacts()
+    leave: LeaveFacts = LeaveFacts()
     sampling: SamplingFacts = SamplingFacts()
+
+    def frames(self) -> dict[str, list[str]]:
+        """Files of the RAW frames of every view, the plate's in the order of ``plate_ev``, a ball's darkest first."""
+        plate = [f"plate/plate_ev{ev:+d}.dng".replace("+0", "0") for ev in self.bracket.plate_ev]
+        count = range(1, self.bracket.ball_frames + 1)
+        balls = {view.name: [f"{view.name}/{view.name}_{i}.dng" for i in count] for view in self.ball_view}
+        return {"plate": plate, **balls}
 
     @model_validator(mode="after")
     def _consistent(self) -> SimulatedScene:
@@ -257,6 +322,14 @@ class SimulatedScene(Strict):
             raise ValueError("calibration: photographs of a board, and there is no [board]")
         if any(view.position_m is None for view in self.view):
             raise ValueError("view: has no position_m; it is required")
+        turns = self.bracket.plate_turn_deg
+        if turns and len(turns) != len(self.bracket.plate_ev):
+            raise ValueError(f"bracket.plate_turn_deg has {len(turns)} entries; expected one per frame of plate_ev")
+        taken = {file for files in self.frames().values() for file in files}
+        if strange := [wrong.file for wrong in self.bracket.wrong_label if wrong.file not in taken]:
+            raise ValueError(f"bracket.wrong_label: no frame {strange}; expected some of {sorted(taken)}")
+        if self.leave.table_coat is not None and self.table.roughness is not None:
+            raise ValueError("leave.table_coat and table.roughness are two glosses of one table; give one")
         if names[0] != "plate" or len(set(names)) < len(names):
             raise ValueError(f"views are {names}; expected 'plate' first and unique names")
         if self.plate.position_m is None:

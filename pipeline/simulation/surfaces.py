@@ -102,4 +102,5 @@ def box_texture(box: BoxModel, texel_m: float, seed: int) -> np.ndarray:
     width, height, depth = box.size_m
     u = (np.arange(round(2 * (width + depth) / texel_m)) + 0.5) * texel_m
     v = (np.arange(round((height + depth) / texel_m)) + 0.5) * texel_m
-    return np.clip(speckled_albedo(u[None, :], v[:, None], box.albedo, 0.9, seed), 0.02, 0.95).astype(np.float32)
+    pixels = speckled_albedo(u[None, :], v[:, None], box.albedo, box.contrast, seed)
+    return np.clip(pixels, 0.02, 0.95).astype(np.float32)

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.simulation import light, shapes, surfaces
-from pipeline.simulation.scene_file import SimulatedScene
+from pipeline.simulation import leaving, light, shapes, surfaces
+from pipeline.simulation.scene_file import RoomModel, SimulatedScene
 from pipeline.simulation.sensor import acescg_from_rec709
+from pipeline.simulation.thrown import SMALL_DEG
 
 PEOPLE_ALBEDO = (0.07, 0.06, 0.06)
 BODY_ALBEDO = (0.03, 0.03, 0.03)
@@ -134,13 +135,18 @@ class Place:
                 if name == "table" and table.roughness is not None:
                     gloss = {"metallic": 0.0, "roughness": table.roughness}
                     material = {"type": "insitu_gltf", "base_color": material["reflectance"], **gloss}
+                if name == "table" and self.scene.leave.table_coat is not None:
+                    coat = {"distribution": "ggx", "alpha": self.scene.leave.table_coat, "int_ior": 1.5, "ext_ior": 1.0}
+                    material = {"type": "roughplastic", "diffuse_reflectance": material["reflectance"], **coat}
                 self._materials[name] = mi.load_dict(material)
         made = {}
-        parts = {"table": (around(whole, list(sheets.values())), whole)}
+        curl = self.scene.leave.curl_radius_m
+        parts = {"table": (around(whole, [] if curl else list(sheets.values())), whole)}
         parts |= {name: ([sheet], sheet) for name, sheet in sheets.items()}
         for name, (spans, extent) in parts.items():
-            shape, uv = rectangles(spans, extent)
-            made[name] = mesh(mi, name, shape, self._materials[name], uv, smooth=False)
+            bent = curl is not None and name != "table"
+            shape, uv = leaving.curled_sheet(extent, curl) if bent and curl else rectangles(spans, extent)
+            made[name] = mesh(mi, name, shape, self._materials[name], uv, smooth=bent)
         self._surfaces[prints] = made
         return made
 
@@ -154,10 +160,41 @@ class Place:
                 self._boxes[f"box_{model.name}"] = mesh(self.mi, model.name, parts, bsdf, uv, smooth=False)
         return self._boxes
 
-    def room(self) -> dict[str, Any]:
-        """The distant light."""
-        bitmap = self.mi.Bitmap(light.mitsuba_envmap(self.scene.light))
-        return {"room": {"type": "envmap", "bitmap": bitmap}}
+    def room(self, small_lamps: bool = True) -> dict[str, Any]:
+        """The distant light, with or without its smallest lamps, or a closed room's walls; and what glows nearby."""
+        facts = self.scene.light
+        if not small_lamps:
+            large = [lamp for lamp in facts.lamp if lamp.diameter_deg >= SMALL_DEG]
+            facts = facts.model_copy(update={"lamp": large})
+        made: dict[str, Any] = {}
+        if self.scene.room is None:
+            made["room"] = {"type": "envmap", "bitmap": self.mi.Bitmap(light.mitsuba_envmap(facts))}
+        else:
+            made |= self.walls(self.scene.room)
+        for number, lamp in enumerate(self.scene.near_lamp):
+            emitter = {"type": "area", "radiance": colour(np.asarray(lamp.radiance) * facts.scale)}
+            sphere = {"type": "sphere", "center": list(lamp.position_m), "radius": lamp.diameter_m / 2}
+            made[f"near_lamp_{number}"] = {**sphere, "emitter": emitter}
+        return made
+
+    def walls(self, room: RoomModel) -> dict[str, Any]:
+        """Six matt faces that look inwards."""
+        transform, half = self.mi.ScalarTransform4f, np.asarray(room.size_m) / 2
+        made = {}
+        for axis in range(3):
+            for sign in (-1, 1):
+                normal = -sign * np.eye(3)[axis]
+                middle = np.asarray(room.centre_m) + sign * half * np.eye(3)[axis]
+                right, up = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+                frame = np.eye(4)
+                frame[:3, 0], frame[:3, 1] = half[(axis + 1) % 3] * right, half[(axis + 2) % 3] * up * -sign
+                frame[:3, 2], frame[:3, 3] = normal, middle
+                albedo = room.wall if axis != 1 else room.ceiling if sign > 0 else room.floor
+                made[f"wall_{'xyz'[axis]}{'np'[sign > 0]}"] = {
+                    "type": "rectangle", "to_world": transform(frame),
+                    "bsdf": {"type": "diffuse", "reflectance": colour(albedo)},
+                }  # fmt: skip
+        return made
 
     def photographer(self, world_from_camera: np.ndarray) -> dict[str, Any]:
         """Camera, tripod column and a person behind it, none of it in front of the lens."""
@@ -192,6 +229,10 @@ class Place:
         if black:
             mirror = {"type": "diffuse", "reflectance": colour((0.0, 0.0, 0.0))}
         radius = self.scene.ball.diameter_m / 2
+        if self.scene.leave.dent:
+            vertices, normals, faces = leaving.dented_sphere(radius, self.scene.leave.dent)
+            dented = (vertices + self.ball_centre, normals, faces)
+            return {"ball": mesh(self.mi, "ball", dented, self.mi.load_dict(mirror))}
         return {"ball": {"type": "sphere", "center": self.ball_centre.tolist(), "radius": radius, "bsdf": mirror}}
 
     def objects(self) -> dict[str, Any]:
@@ -211,9 +252,10 @@ class Place:
             made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, self.mi.load_dict(bsdf))
         return made
 
-    def load(self, *parts: dict[str, Any], prints: bool = True) -> Any:
+    def load(self, *parts: dict[str, Any], prints: bool = True, small_lamps: bool = True) -> Any:
         """A Mitsuba scene of the table, the printed sheets on it, the boxes, the room and the given parts."""
-        scene: dict[str, Any] = {"type": "scene", **self.table_and_prints(prints), **self.boxes(), **self.room()}
+        scene: dict[str, Any] = {"type": "scene", **self.table_and_prints(prints), **self.boxes()}
+        scene |= self.room(small_lamps)
         for part in parts:
             scene.update(part)
         return self.mi.load_dict(scene)

@@ -1,0 +1,163 @@
+"""What a simulated capture does that is hard, or that no estimator models: laws of the simulator itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.run.errors import ManifestError
+from pipeline.run.manifest import CaptureFacts
+from pipeline.simulation import capture, shapes, thrown
+from pipeline.simulation.leaving import SHEET_LIFT_M, curled_sheet, dented_sphere, glare
+from pipeline.simulation.light import unit_direction
+from pipeline.simulation.scene_file import BoxModel, DentFacts, LampFacts, SimulatedScene, load_scene
+from pipeline.simulation.world import Place, rectangles
+from pipeline.transport.proxies import box
+from pipeline.transport.variant import use_mitsuba
+
+ROOM = {
+    "centre_m": (0.1, 0.5, 0.2), "size_m": (2.0, 2.5, 2.2), "wall": (0.5,) * 3, "ceiling": (0.6,) * 3,
+    "floor": (0.3,) * 3,
+}  # fmt: skip
+SCENES = Path(__file__).parents[1] / "sample_captures/scenes"
+
+
+def desk_scene(**changes: object) -> SimulatedScene:
+    return load_scene(SCENES / "desk.toml").model_copy(update=changes)
+
+
+def test_glare_keeps_an_even_picture_and_spreads_the_stated_share() -> None:
+    even = np.full((40, 60, 3), 5.0)
+    np.testing.assert_allclose(glare(even, 0.1, 20.0), even, rtol=1e-12)
+    spot = np.zeros((101, 101, 1))
+    spot[50, 50] = 1.0
+    seen = glare(spot, 0.2, 4.0)
+    # The bell is cut at half a picture, so all of it falls inside; its peak is 1 over the sum of its samples.
+    assert seen.sum() == pytest.approx(1.0, rel=1e-9)
+    rows = np.arange(-50, 51)
+    bell = (1 + (rows[:, None] ** 2 + rows**2) / 16.0) ** -1.5
+    np.testing.assert_allclose(seen[..., 0], 0.8 * spot[..., 0] + 0.2 * bell / bell.sum(), atol=1e-12)
+
+
+def test_normals_of_a_dented_sphere_are_those_of_its_shape() -> None:
+    dents = [
+        DentFacts(azimuth_deg=30, elevation_deg=20, depth_m=0.002, sigma_deg=12),
+        DentFacts(azimuth_deg=200, elevation_deg=60, depth_m=-0.001, sigma_deg=25),
+    ]
+    vertices, normals, _ = dented_sphere(0.06, dents, rows=256)
+    grid = vertices.reshape(257, 513, 3)
+    up, right = grid[2:, 1:-1] - grid[:-2, 1:-1], grid[1:-1, 2:] - grid[1:-1, :-2]
+    seen = np.cross(right, up)[8:-8]  # not at the poles, where a row is short
+    seen /= np.linalg.norm(seen, axis=-1, keepdims=True)
+    # Central differences over 1.4 degrees deviate by the third derivative: dents of 12 degrees, 0.05 degrees at most.
+    cosine = (seen * normals.reshape(257, 513, 3)[9:-9, 1:-1]).sum(-1)
+    assert np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))) < 0.05
+    deepest = vertices[np.argmax(vertices @ unit_direction(30, 20) / np.linalg.norm(vertices, axis=1))]
+    assert np.linalg.norm(deepest) == pytest.approx(0.058, abs=2e-5)  # the nearest vertex is up to 0.5 degrees away
+    round_ball = dented_sphere(0.06, [], rows=64)
+    np.testing.assert_allclose(round_ball[0], 0.06 * round_ball[1], atol=1e-12)
+
+
+def test_a_curled_sheet_is_a_flat_one_bent_up() -> None:
+    sheet = (-0.01, -0.02, 0.22, 0.16)
+    (vertices, normals, faces), uv = curled_sheet(sheet, 2.0)
+    off = vertices[:, 0] - 0.105
+    np.testing.assert_allclose(vertices[:, 1], off**2 / 4.0 + SHEET_LIFT_M, atol=1e-15)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 1] > 0).all()  # it looks up
+    tangent = np.stack([np.ones_like(off), off / 2.0, 0 * off], -1)
+    np.testing.assert_allclose((tangent * normals).sum(1), 0, atol=1e-12)
+    (flat, _, _), flat_uv = rectangles([sheet], sheet)
+    for corner, place in zip(flat, flat_uv):
+        nearest = np.argmin(np.linalg.norm(vertices[:, [0, 2]] - corner[[0, 2]], axis=1))
+        np.testing.assert_allclose(uv[nearest], place, atol=1e-12)
+
+
+def test_light_thrown_by_the_ball_is_where_the_law_of_reflection_puts_it() -> None:
+    """Lamp at the zenith: what meets the sphere beyond the angle t from its top lands within a known radius.
+
+    A ray that meets it there leaves at 2 t from the zenith, from the height R (1 + cos t). Tolerance: four sigma of the
+    rays counted, and half a percent for the smoothing and the cells at the rim.
+    """
+    lamp = LampFacts(azimuth_deg=0, elevation_deg=89.999, diameter_deg=0.2, radiance=(3.0, 2.0, 1.0))
+    radius, rays = 0.05, 1_000_000
+    found = thrown.thrown_irradiance(lamp, 2.0, np.array([0.0, radius, 0.0]), radius, (0.9, 0.8, 0.7), 1, rays)
+    at = (np.arange(len(found)) - thrown.HALF_WIDTH_CELLS + 0.5) * thrown.CELL_M
+    away = np.hypot(at[:, None], at[None, :])
+    arriving = 2 * np.pi * (1 - np.cos(np.radians(0.1))) * 2.0 * np.array([3 * 0.9, 2 * 0.8, 1 * 0.7])
+    for t in np.radians([52.0, 60.0, 70.0]):
+        limit = radius * np.sin(t) - radius * (1 + np.cos(t)) * np.tan(2 * t)
+        share = 1 - np.sin(t) ** 2
+        landed = found[away < limit].sum(0) * thrown.CELL_M**2
+        expected = np.pi * radius**2 * arriving * share
+        np.testing.assert_allclose(landed, expected, rtol=4 / np.sqrt(rays * share) + 0.005)
+
+
+def test_a_wrong_label_is_written_and_the_true_time_kept(tmp_path: Path) -> None:
+    import exifread
+
+    file = "plate/plate_ev0.dng"
+    scene = desk_scene()
+    wrong_label = {"wrong_label": [{"file": file, "factor": 1.4}]}
+    bracket = scene.bracket.model_validate(scene.bracket.model_dump() | wrong_label)
+    camera = scene.camera.model_copy(update={"width": 32, "height": 24})
+    scene = scene.model_copy(update={"bracket": bracket, "camera": camera})
+    shoot = capture.Shoot(scene, tmp_path, capture.sensor_of(scene))
+    for name in (file, "plate/plate_ev+2.dng"):
+        shoot.take(name, np.full((24, 32, 3), 10.0), 9)
+    wrong, right = shoot.exposures[file], shoot.exposures["plate/plate_ev+2.dng"]
+    assert wrong["true_s"] == right["true_s"]
+    assert wrong["label_s"] == pytest.approx(1.4 * right["label_s"], rel=1e-4)
+    with (tmp_path / file).open("rb") as stream:
+        label = exifread.process_file(stream, details=False)["EXIF ExposureTime"].values[0]
+    assert float(label) == pytest.approx(wrong["label_s"])
+
+
+def test_frames_that_are_not_taken_are_refused(tmp_path: Path) -> None:
+    text = (SCENES / "desk.toml").read_text()
+    path = tmp_path / "scene.toml"
+    wrong = '[[bracket.wrong_label]]\nfile = "plate/plate_ev1.dng"\nfactor = 1.4\n\n[sampling]'
+    path.write_text(text.replace("[sampling]", wrong))
+    with pytest.raises(ManifestError, match=r"no frame \['plate/plate_ev1.dng'\]"):
+        load_scene(path)
+    path.write_text(text.replace("ball_frames = 6", "ball_frames = 6\nplate_turn_deg = [[0.1, 0.0]]"))
+    with pytest.raises(ManifestError, match="plate_turn_deg has 1 entries"):
+        load_scene(path)
+
+
+def test_stated_boxes_and_room_are_facts_of_the_same_shape() -> None:
+    """The [[proxy]] of a box, as insitu builds it, has the corners of the box that is rendered."""
+    model = BoxModel(
+        name="crate", position_m=(0.2, -0.1), size_m=(0.1, 0.2, 0.3), yaw_deg=25, albedo=(0.5, 0.5, 0.5), stated=True
+    )
+    hidden = model.model_copy(update={"name": "tin", "stated": False})
+    scene = SimulatedScene.model_validate(desk_scene(box=[model, hidden]).model_dump() | {"room": ROOM})
+    tables: dict[str, object] = {}
+    for heading, keys in capture.capture_tables(scene):
+        name = heading.strip("[]")
+        if heading.startswith("[["):
+            tables.setdefault(name, []).append(keys)  # type: ignore[attr-defined]
+        else:
+            tables.update({name: keys} if name else keys)
+    facts = CaptureFacts.model_validate(tables)
+    assert facts.room is not None
+    assert facts.room.size_m == (2.0, 2.5, 2.2)
+    (proxy,) = facts.proxy
+    assert proxy.centre_m
+    assert proxy.size_m
+    corners, _ = box(proxy.centre_m, proxy.size_m, proxy.yaw_deg)
+    rendered = shapes.standing_box(model)[0][0]
+    gap = np.linalg.norm(rendered[:, None] - corners[None], axis=-1).min(1)
+    assert gap.max() < 1e-12
+
+
+def test_walls_of_a_room_look_inwards() -> None:
+    mi = use_mitsuba()
+    scene = SimulatedScene.model_validate(desk_scene().model_dump() | {"room": ROOM})
+    walls = mi.load_dict({"type": "scene", **Place(mi, scene).walls(scene.room)})
+    ways = np.concatenate([np.eye(3), -np.eye(3)])
+    hit = walls.ray_intersect(mi.Ray3f(mi.Point3f(0.1, 0.5, 0.2), mi.Vector3f(ways.T.astype(np.float32))))
+    np.testing.assert_allclose(np.array(hit.t), [1.0, 1.25, 1.1] * 2, rtol=1e-5)
+    np.testing.assert_allclose(np.array(hit.n).T, -ways, atol=1e-6)
