@@ -27,6 +27,7 @@ from pipeline.run.formats import write_bytes
 from pipeline.simulation import capture, shapes
 from pipeline.simulation.leaving import glare
 from pipeline.simulation.lens import Lens, aim, blur, look_at
+from pipeline.simulation.light import SMALL_DEG, with_small_lamps
 from pipeline.simulation.photograph import (
     Measure,
     camera_rays,
@@ -40,7 +41,7 @@ from pipeline.simulation.photograph import (
 )
 from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts, load_scene
 from pipeline.simulation.spectral import Size, main, twin
-from pipeline.simulation.thrown import SMALL_DEG, seen_on_table, thrown_irradiance
+from pipeline.simulation.thrown import seen_on_table, thrown_irradiance
 from pipeline.simulation.world import Place
 
 SMOOTHING_PX = 5.0  # of the light that the ball throws
@@ -367,7 +368,7 @@ def surface_truth(studio: Studio, out: Path, pose: np.ndarray, progress: Callabl
     light = picture(
         studio.mi, shoot, measure, (height, width), sampling.environment, sampling.pass_samples, 70_000
     )  # fmt: skip
-    capture.write_picture(out / "truth" / "environment.exr", light)
+    capture.write_picture(out / "truth" / "environment.exr", with_small_lamps(scene.light, light))
 
 
 def box_mean(values: np.ndarray, half: int = 2) -> np.ndarray:

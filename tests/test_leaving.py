@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.conventions import latlong_solid_angles
 from pipeline.run.errors import ManifestError
 from pipeline.run.manifest import CaptureFacts
 from pipeline.simulation import capture, shapes, thrown
 from pipeline.simulation.leaving import SHEET_LIFT_M, curled_sheet, dented_sphere, glare
-from pipeline.simulation.light import unit_direction
+from pipeline.simulation.light import mitsuba_envmap, unit_direction, with_small_lamps
 from pipeline.simulation.scene_file import BoxModel, DentFacts, LampFacts, SimulatedScene, load_scene
 from pipeline.simulation.world import Place, rectangles
 from pipeline.transport.proxies import box
@@ -161,3 +162,20 @@ def test_walls_of_a_room_look_inwards() -> None:
     hit = walls.ray_intersect(mi.Ray3f(mi.Point3f(0.1, 0.5, 0.2), mi.Vector3f(ways.T.astype(np.float32))))
     np.testing.assert_allclose(np.array(hit.t), [1.0, 1.25, 1.1] * 2, rtol=1e-5)
     np.testing.assert_allclose(np.array(hit.n).T, -ways, atol=1e-6)
+
+
+def test_a_small_lamp_keeps_its_flux_in_the_true_environment() -> None:
+    """Of a sun, alone in the sky: flux of the coarse picture against the sum over the map that Mitsuba is given.
+
+    The map's rows run from pole to pole, so each stands for the belt around it; both sums are exact but for the belt's
+    curvature: 1e-3.
+    """
+    scene = load_scene(SCENES / "courtyard.toml")
+    dark = {"wall": (0, 0, 0), "ceiling": (0, 0, 0), "floor": (0, 0, 0), "softbox": [], "map_width": 2048}
+    sky = scene.light.model_validate(scene.light.model_dump() | dark)
+    texels = mitsuba_envmap(sky).astype(float)
+    rows = np.arange(len(texels)) * np.pi / (len(texels) - 1)
+    belts = np.sin(rows) * 2 * np.sin(np.pi / (len(texels) - 1) / 2) * 2 * np.pi / texels.shape[1]
+    flux = (texels * belts[:, None, None]).sum((0, 1))
+    found = with_small_lamps(sky, np.zeros((128, 256, 3)))
+    np.testing.assert_allclose((found * latlong_solid_angles(128, 256)[..., None]).sum((0, 1)), flux, rtol=1e-3)

@@ -15,7 +15,6 @@ from pipeline.simulation.light import unit_direction
 from pipeline.simulation.photograph import Measure
 from pipeline.simulation.scene_file import LampFacts
 
-SMALL_DEG = 2.0  # diameter below which a lamp is traced so
 CELL_M = 0.002
 HALF_WIDTH_CELLS = 300
 RAYS = 8_000_000

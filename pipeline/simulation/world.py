@@ -14,7 +14,6 @@ import numpy as np
 from pipeline.simulation import leaving, light, shapes, surfaces
 from pipeline.simulation.scene_file import RoomModel, SimulatedScene
 from pipeline.simulation.sensor import acescg_from_rec709
-from pipeline.simulation.thrown import SMALL_DEG
 
 PEOPLE_ALBEDO = (0.07, 0.06, 0.06)
 BODY_ALBEDO = (0.03, 0.03, 0.03)
@@ -164,7 +163,7 @@ class Place:
         """The distant light, with or without its smallest lamps, or a closed room's walls; and what glows nearby."""
         facts = self.scene.light
         if not small_lamps:
-            large = [lamp for lamp in facts.lamp if lamp.diameter_deg >= SMALL_DEG]
+            large = [lamp for lamp in facts.lamp if lamp.diameter_deg >= light.SMALL_DEG]
             facts = facts.model_copy(update={"lamp": large})
         made: dict[str, Any] = {}
         if self.scene.room is None:
