@@ -196,7 +196,7 @@ def note(build: Build) -> str:
 
 
 def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """The predicted parts, noise scaled to what the run's samples had of it, and stated uncertainties as they are now."""
+    """The predicted parts, noise scaled to what the run's samples had of it, and stated uncertainties as now stated."""
     numbers = (build.record("render") or {"numbers": {}})["numbers"]
     samples = build.settings.params["render"]["samples"]
     last = pilot["renders"][-1]

@@ -27,7 +27,11 @@ SUPERSAMPLES = ((512, 2), (1024, 3), (math.inf, 4))
 PILOT_WIDTH = 512
 # Share of a stage's CPU at `PILOT_WIDTH` that grows with the texels of map and texture (docs/figures.md: 512 to 2048).
 GROWING = {"probe": 0.155, "lights": 1.0, "reflectance": 0.41}
-COMPOSITE = (0.6, 0.8)  # CPU seconds, and per megapixel of the plate: the bundled captures
+# CPU seconds, and per megapixel of the plate, on the bundled desk: of the composite, and of the first picture shown.
+COMPOSITE, SHOWN = (0.6, 0.8), (0.5, 3.0)
+STARTING = 0.5  # CPU seconds of a render whatever its size: shapes, tables of the light
+BY_SAMPLES = 0.5  # of a pilot render of few samples: what grows with them; measured as soon as there are two
+FEWER_TRACED = 0.25  # the traced share falls with a picture's side to this power: desk at 256, 512, 1024 px
 POWERS = tuple(0.2 + 0.02 * step for step in range(26))  # of the samples; 0.5 without a denoiser
 
 
@@ -106,7 +110,7 @@ class Model:
     stated: dict[str, float]  # figure -> standard uncertainty
     stages: dict[str, float]  # CPU seconds of the pilot's stages
     work: Law  # pixel samples of a whole render, with a negative power
-    render: tuple[float, float]  # CPU seconds, and per pixel sample
+    render: tuple[float, float]  # CPU seconds of a whole render, and per pixel sample
     megapixels: float
 
     def parts(self, setting: Setting) -> dict[str, dict[str, float]]:
@@ -129,8 +133,9 @@ class Model:
         """CPU seconds per stage up to the composite."""
         texels = (setting.width / self.width) ** 2
         costs = {name: spent * (1 + GROWING.get(name, 0.0) * (texels - 1)) for name, spent in self.stages.items()}
-        costs["render"] = self.render[0] + self.render[1] * self.work.at(setting.samples)
-        costs["composite"] = COMPOSITE[0] + COMPOSITE[1] * self.megapixels
+        shown, composite = (start + more * self.megapixels for start, more in (SHOWN, COMPOSITE))
+        costs["render"] = self.render[0] + self.render[1] * self.work.at(setting.samples) + shown
+        costs["composite"] = composite
         return costs
 
     def seconds(self, setting: Setting) -> float:
@@ -152,9 +157,7 @@ def fitted(pilot: Mapping[str, Any]) -> Model:
         }
         if known:
             sampling[figure] = law_of({(int((ns := pair.split("-"))[0]), int(ns[1])): d for pair, d in known.items()})
-    renders = pilot["renders"]
-    grown = pilot["scale"] ** 2
-    works = [(run["samples"], run["work"] * grown) for run in renders]
+    works = [(run["samples"], run["work"] * pilot["scale"] ** (2 - FEWER_TRACED)) for run in pilot["renders"]]
     return Model(
         sampling=sampling,
         width=pilot["width"],
@@ -162,9 +165,22 @@ def fitted(pilot: Mapping[str, Any]) -> Model:
         stated={figure: math.hypot(0.0, *parts.values()) for figure, parts in pilot["stated"].items()},
         stages=pilot["stages"],
         work=growth_of(works),
-        render=line_of([(run["work"], run["cpu_seconds"]) for run in renders]),
+        render=price_of([(run["work"], run["cpu_seconds"]) for run in pilot["renders"][1:]], pilot["scale"]),
         megapixels=pilot["megapixels"],
     )
+
+
+def price_of(renders: Sequence[tuple[float, float]], scale: int) -> tuple[float, float]:
+    """CPU seconds of a whole picture without its samples, and per pixel sample, from small ones (work, CPU seconds).
+
+    What does not grow with the samples grows with the picture's area, but for `STARTING`.
+    """
+    if len(renders) > 1:
+        flat, each = line_of(renders)
+    else:
+        ((work, seconds),) = renders
+        flat, each = (1 - BY_SAMPLES) * seconds, BY_SAMPLES * seconds / work
+    return flat + (scale**2 - 1) * max(flat - STARTING, 0.0), each
 
 
 def growth_of(works: Sequence[tuple[float, float]]) -> Law:
