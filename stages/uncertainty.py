@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.budget import geometry, light, pixels
-from pipeline.budget.response import STEP_RAD, Grid, Layers, Response, Seen, points_on, rendered
+from pipeline.budget.response import DIMMER, STEP_RAD, Grid, Layers, Response, Seen, points_on, rendered
 from pipeline.conventions import ACESCG
-from pipeline.image.colour import luminance
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run.formats import read_mask
@@ -113,23 +112,25 @@ class Studio:
         self.rgb = np.asarray(environment.rgb(), float)
         self.irradiance = self.upward(self.rgb)
         self.rays = LensRays(camera, view.world_from_camera)
-        white = float(luminance(self.irradiance)) / np.pi
-        self.lit = place_objects(wishes, plane, white, materials)[0]
         self.dark = place_objects(wishes, plane, 0.0, materials)[0]  # without what they send out themselves
 
     def upward(self, rgb: np.ndarray) -> np.ndarray:
         """Irradiance (3,) on the plane."""
         return np.asarray(irradiance(rgb, self.plane.normal[None])[0])
 
-    def worlds(self, rgb: np.ndarray, emitters: list[Emitter], black: bool = False) -> Worlds:
-        """The scene under a map; without the ground's and proxies' light when ``black``."""
-        ground = np.zeros(3) if black else self.albedo
-        proxies = [p.model_copy(update={"albedo": np.zeros(3)}) for p in self.proxies] if black else self.proxies
-        return build_worlds(self.plane, ground, rgb, self.dark, proxies, emitters, self.surface, self.occluders)
+    def worlds(self, rgb: np.ndarray, emitters: list[Emitter], ground: float = 1.0) -> Worlds:
+        """The scene under a map, its real surfaces ``ground`` times as bright."""
+        proxies = [
+            proxy if proxy.albedo is None else proxy.model_copy(update={"albedo": ground * proxy.albedo})
+            for proxy in self.proxies
+        ]
+        return build_worlds(
+            self.plane, ground * self.albedo, rgb, self.dark, proxies, emitters, self.surface, self.occluders
+        )
 
-    def seen(self, rgb: np.ndarray, emitters: list[Emitter], black: bool = False) -> Seen:
+    def seen(self, rgb: np.ndarray, emitters: list[Emitter], ground: float = 1.0) -> Seen:
         """A render."""
-        return rendered(self.worlds(rgb, emitters, black), self.rays, self.grid, self.samples, DEPTH, seed=1)
+        return rendered(self.worlds(rgb, emitters, ground), self.rays, self.grid, self.samples, DEPTH, seed=1)
 
 
 def settings(records: dict[str, Any], stage: str, knob: str, otherwise: Any) -> Any:
@@ -182,7 +183,7 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
     if not followed:
         return []
     whole = studio.seen(studio.rgb, studio.emitters)
-    response = Response(studio.grid, full, whole, studio.seen(studio.rgb, studio.emitters, black=True))
+    response = Response(studio.grid, full, whole, studio.seen(studio.rgb, studio.emitters, DIMMER))
     modes = []
     for pattern in followed:
         if pattern.factor is not None:

@@ -106,13 +106,19 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     unseen = np.where((seen < UNSEEN)[..., None], sigma, 0)
     sigma = sigma - unseen
     rows = max(1, round(height * ALIKE_DEG / 180))
-    found = []
-    for name, axis in zip(AXIS_NAMES, AXES, strict=True):
-        lobe = np.maximum(directions @ axis, 0)[..., None] ** 2
-        cells = _cells(weight * lobe * sigma, directions[..., 1], rows)
-        level = (weight * lobe * np.abs(rgb)).sum((0, 1))
-        relative = np.sqrt((cells**2).sum(0)) / np.maximum(level, 1e-300)
-        found.append(_radiance(f"sky_{name}", "sky", lobe * np.maximum(rgb, 0) * relative, rgb))
+    level = np.maximum(rgb, 0)
+    lobes, direct = [], np.zeros(3)
+    for axis in AXES:
+        cosine = np.maximum(directions @ axis, 0)[..., None]
+        lobe = cosine**2
+        errors = _cells(weight * lobe * sigma, directions[..., 1], rows)
+        energy = (weight * lobe * level).sum((0, 1))
+        lobes.append(lobe * level * np.sqrt((errors**2).sum(0)) / np.maximum(energy, 1e-300))
+        direct += (_cells(weight * cosine * sigma, directions[..., 1], rows) ** 2).sum(0)
+    # Six numbers average what varies within a lobe: as much is given back as irradiance has of it.
+    carried = sum((irradiance(lobe, AXES) ** 2).sum(0) for lobe in lobes)
+    back = np.sqrt(np.divide(direct, carried, out=np.ones(3), where=carried > 0))
+    found = [_radiance(f"sky_{name}", "sky", lobe * back, rgb) for name, lobe in zip(AXIS_NAMES, lobes, strict=True)]
     if unseen.any():
         found.append(_radiance("unseen", "unseen", unseen, rgb))
     return [pattern for pattern in found if pattern.bound > 0]

@@ -7,15 +7,17 @@ the full layers: noise that both share cancels, and texture and edges are the fu
 The albedo was measured under the same light: where the irradiance E on the plane is too high by s, the albedo is too
 low by s, and what the plane sends out stays what the plate shows. So per unit of a pattern with irradiance s E,
 
-    d lost   = lost[pattern]   - s lost          d gained = gained[pattern] - s gained
-    d object = object[pattern] - s (object - object over black ground)
+    d X = X[pattern] - s dX / d ln(albedo),        X: lost light, added light, objects
 
-A single light that is too bright thus changes no shadow, and objects only as far as the ground does not light them.
+with the derivative from a render over a `DIMMER` ground: once the albedo for light that meets the ground once, twice
+for what it sends to an object and receives back. A light that is too bright as a whole thus changes no shadow, and
+objects only as far as the ground does not light them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +26,9 @@ from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import LensRays, Rays, Samples, seen_points, trace
 
 STEP_RAD = 0.02  # of a turn that is rendered: well above rounding, below the width of a lamp's penumbra
+DIMMER = 0.8  # albedo of the ground in the second render, relative: the derivative by it comes from the difference
 SMOOTHED = 3  # squares of the grid over which renders are summed before they are divided
+LAYERS = ("lost", "gained", "obj")
 MOST_RATIO = 4.0  # of a pattern's part in the whole: beyond, the whole is too faint to be divided by
 
 
@@ -134,41 +138,38 @@ class Layers:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Renders of the whole light, over the real and over black ground; and what patterns make of the composite."""
+    """Renders of the whole light, over the real and over a `DIMMER` ground; what patterns make of the composite."""
 
     grid: Grid
     layers: Layers
     whole: Seen
-    black: Seen
+    dim: Seen
 
-    @property
-    def by_ground(self) -> np.ndarray:
-        """(h, w, 3) of the window: share of the objects' light that comes by way of the ground."""
-        return self.grid.enlarged(np.clip(1 - share_of(self.black.obj, self.whole.obj), 0, 1))
+    def by_albedo(self, name: str) -> np.ndarray:
+        """(h, w, 3) of the window: d ln X / d ln(albedo) of lost, gained or obj."""
+        share = share_of(getattr(self.dim, name), getattr(self.whole, name))
+        return self.grid.enlarged(np.maximum(1 - share, 0) / (1 - DIMMER))
 
     def of_factor(self, factor: np.ndarray) -> np.ndarray:
         """Change of the composite when all light is brighter by a relative factor (3,)."""
-        return np.asarray(factor * (1 - self.by_ground) * self.layers.obj)
+        return self._changed(dict.fromkeys(LAYERS, 1.0), factor, factor)
 
     def of_light(self, seen: Seen, irradiance_share: np.ndarray) -> np.ndarray:
         """When the light of a render is added that gives a share (3,) of the plane's irradiance."""
-        lost, gained, obj = (
-            self.grid.enlarged(share_of(getattr(seen, name), getattr(self.whole, name)))
-            for name in ("lost", "gained", "obj")
-        )
-        full = self.layers
-        return full.changed(
-            (lost - irradiance_share) * full.lost,
-            (gained - irradiance_share) * full.gained,
-            (obj - irradiance_share * self.by_ground) * full.obj,
-        )
+        shares = {name: self.grid.enlarged(share_of(getattr(seen, name), getattr(self.whole, name))) for name in LAYERS}
+        return self._changed(shares, irradiance_share, 1.0)
 
     def of_turn(self, apart: Seen, irradiance_share: np.ndarray) -> np.ndarray:
         """When the light moves: by the difference of two renders, whose sign changes over an edge, so not relative."""
-        lost, gained, obj = (self.grid.enlarged(summed(v) / SMOOTHED**2) for v in (apart.lost, apart.gained, apart.obj))
+        lost, gained, obj = (self.grid.enlarged(summed(getattr(apart, name)) / SMOOTHED**2) for name in LAYERS)
         full = self.layers
-        return full.changed(
-            np.minimum(full.lost + lost, 0) - full.lost - irradiance_share * full.lost,
-            gained - irradiance_share * full.gained,
-            obj - irradiance_share * self.by_ground * full.obj,
-        )
+        moved = full.changed(np.minimum(full.lost + lost, 0) - full.lost, gained, obj)
+        return moved + self._changed(dict.fromkeys(LAYERS, 0.0), irradiance_share, 1.0)
+
+    def _changed(self, shares: dict[str, Any], irradiance_share: np.ndarray, factor: np.ndarray | float) -> np.ndarray:
+        """``factor * shares`` of every layer, less what the albedo undoes."""
+        parts = [
+            (factor * shares[name] - irradiance_share * self.by_albedo(name)) * getattr(self.layers, name)
+            for name in LAYERS
+        ]
+        return self.layers.changed(*parts)

@@ -1,0 +1,222 @@
+"""Do the stated uncertainties hold? One place, photographed and built again and again; errors over sigma, pooled.
+
+    .venv/bin/python -m benchmarks.budget [COUNT] [--scene SCENE.toml] [--folder build/budget]
+
+Every capture (`benchmarks.resimulate`: own noise, shutter errors, corners, lens and pose) is built to the stage
+``uncertainty`` and compared with the truth, scaled by the one factor s = median(LS_b / P) of the capture, as `evaluate`
+does: an error of the plate's own scale is none of the composite. Compared are pixels `APART` px apart and means over
+regions (each object, shadows in tiles). A z is an error over its sigma, one per colour channel. Two questions:
+
+    scatter   error less its mean over the captures: do the variances describe what noise does?
+    truth     the whole error: what no variance holds (near field, blur of the map, truth's own noise) is in it
+
+A capture leaves one small file and its build is deleted, so COUNT may grow and a broken run goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.resimulate import photograph, place_of
+from pipeline.budget.pixels import PLATE_PX, RENDER_PX, SHADOW
+from pipeline.image.truth import load_truth
+from pipeline.run.cli import main as insitu
+from pipeline.run.cli import say
+from pipeline.run.formats import read_exr
+
+APART = 32  # px
+TILE = 48  # px, of the regions into which shadows are cut
+FEWEST = 200  # shadow pixels of a tile that is a region
+SETTINGS = ("probe.width=256", "reflectance.texture_px=256", "render.samples=16", "render.depth=8")
+EXPECTED = {"50": (0.45, 0.55), "68": (0.62, 0.74), "95": (0.90, 0.98)}
+QUANTILES = {"50": 0.67449, "68": 1.0, "95": 1.95996}  # of |z|, normal
+BINS = np.array([-np.inf, -3, -2.5, -2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, np.inf])
+DOCS = Path("docs/benchmarks")
+
+
+def regions(truth_plate: np.ndarray, truth: np.ndarray, coverage: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Names and masks (H, W): every object, shadows in tiles. From truth alone, so that all captures share them."""
+    found = {name: cover > 0.999 for name, cover in coverage.items() if (cover > 0.999).sum() >= FEWEST}
+    covered = np.sum(list(coverage.values()), axis=0) > 0
+    change = np.linalg.norm(truth - truth_plate, axis=-1) > SHADOW * np.linalg.norm(truth_plate, axis=-1)
+    for top in range(0, change.shape[0], TILE):
+        for left in range(0, change.shape[1], TILE):
+            mask = np.zeros_like(change)
+            part = np.s_[top : top + TILE, left : left + TILE]
+            mask[part] = (change & ~covered)[part]
+            if mask.sum() >= FEWEST:
+                found[f"shadow_{top}_{left}"] = mask
+    return found
+
+
+def measured(build: Path, truth_file: Path) -> dict[str, Any]:
+    """Errors and sigmas of pixels and of regions of one build, and the budget by source."""
+    truth = load_truth(truth_file)
+    composite, plate = read_exr(build / "composite/composite.exr"), read_exr(build / "develop/photographs/plate.exr")
+    unsure = read_exr(build / "uncertainty/uncertainty.exr")
+    scale = float(np.median(np.linalg.norm(plate.rgb(), axis=-1) / np.linalg.norm(truth.plate, axis=-1)))
+    error, sigma = composite.rgb() - scale * truth.with_objects, unsure.rgb("sigma").astype(float)
+    own = {name: unsure.rgb(name).astype(float) ** 2 for name in ("plate", "render")}
+    modes = [unsure.rgb(f"mode_{name}").astype(float) for name in unsure.attributes["insitu:modes"].split(",")]
+    change = np.linalg.norm(truth.with_objects - truth.plate, axis=-1)
+    covered = np.sum(list(truth.coverage.values()), axis=0)
+    kinds = {
+        "object": covered > 0.999,
+        "shadow": (covered == 0) & (change > SHADOW * np.linalg.norm(truth.plate, axis=-1)),
+    }
+    lattice = np.zeros(covered.shape, bool)
+    lattice[APART // 2 :: APART, APART // 2 :: APART] = True
+    pixels = {
+        kind: {"error": error[mask & lattice].tolist(), "sigma": sigma[mask & lattice].tolist()}
+        for kind, mask in kinds.items()
+    }
+    means: dict[str, Any] = {}
+    for name, mask in regions(truth.plate, truth.with_objects, truth.coverage).items():
+        variance = sum(
+            own[source][mask].mean(0) * min(1.0, alike / mask.sum())
+            for source, alike in (("plate", PLATE_PX), ("render", RENDER_PX))
+        )
+        shared = sum(mode[mask].mean(0) ** 2 for mode in modes)
+        means[name] = {
+            "error": error[mask].mean(0).tolist(), "sigma": np.sqrt(variance + shared).tolist(),
+            "level": composite.rgb()[mask].mean(0).tolist(), "own": np.sqrt(variance).tolist(),
+        }  # fmt: skip
+    budget = json.loads((build / "uncertainty/budget.json").read_text())
+    seconds = {s: json.loads((build / s / "record.json").read_text())["cpu_seconds"] for s in ("render", "uncertainty")}
+    return {"scale": scale, "pixels": pixels, "means": means, "budget": budget["regions"], "cpu_seconds": seconds}
+
+
+def build_one(scene: Any, pictures: Any, number: int, folder: Path) -> None:
+    """Photograph and build capture ``number``, keep its record, delete the rest."""
+    work = folder / f"work_{number:03d}"
+    shutil.rmtree(work, ignore_errors=True)
+    photograph(scene, pictures, number, folder / "radiance", work / "capture")
+    asked = [word for setting in (*SETTINGS, f"render.seed={number}") for word in ("--set", setting)]
+    out = work / "build"
+    code = insitu(
+        ["run", str(work / "capture"), "--out", str(out), "--quality", "draft", "--upto", "uncertainty", *asked]
+    )
+    if code == 0:
+        found = measured(out, work / "capture/truth/truth.json")
+        part = folder / f"capture_{number:03d}.part"
+        part.write_text(json.dumps(found))
+        part.rename(part.with_suffix(".json"))
+    else:
+        say(f"capture {number}: insitu ended with {code}")
+    shutil.rmtree(work)
+
+
+def stacked(records: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Errors and sigmas (captures, places, 3) of each kind of place."""
+    found = {}
+    for kind in ("object", "shadow"):
+        values = [[record["pixels"][kind][key] for record in records] for key in ("error", "sigma")]
+        found[f"{kind} pixels"] = (np.array(values[0]), np.array(values[1]))
+    for kind, chosen in (("object means", False), ("shadow means", True)):
+        names = [name for name in records[0]["means"] if name.startswith("shadow_") == chosen]
+        values = [[[r["means"][name][key] for name in names] for r in records] for key in ("error", "sigma")]
+        found[kind] = (np.array(values[0]), np.array(values[1]))
+    return found
+
+
+def coverage(z: np.ndarray) -> dict[str, Any]:
+    """Shares inside the central intervals, mean, standard deviation and histogram of finite z."""
+    z = z[np.isfinite(z)]
+    inside = {name: float((np.abs(z) < limit).mean()) for name, limit in QUANTILES.items()}
+    good = {name: bool(low <= inside[name] <= high) for name, (low, high) in EXPECTED.items()}
+    return {
+        "n": int(z.size), "inside": inside, "holds": good, "mean": float(z.mean()), "std": float(z.std()),
+        "histogram": np.histogram(z, BINS)[0].tolist(),
+    }  # fmt: skip
+
+
+def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
+    """Pooled coverage of every kind of place, against the captures' own mean and against the truth."""
+    count, result = len(records), {}
+    for kind, (error, sigma) in stacked(records).items():
+        if not error.size:
+            continue
+        spread = np.sqrt(count / (count - 1)) if count > 1 else np.nan  # the mean took its share of the scatter
+        mean = error.mean(0)
+        result[kind] = {
+            "places": error.shape[1],
+            "scatter": coverage((error - mean) / sigma * spread),
+            "truth": coverage(error / sigma),
+            "bias_over_sigma_rms": float(np.sqrt(np.mean((mean / np.sqrt((sigma**2).mean(0))) ** 2))),
+            "scatter_over_sigma_rms": float(np.sqrt(np.mean((error - mean) ** 2) / np.mean(sigma**2)) * spread),
+        }
+    return result
+
+
+def page(found: dict[str, Any], command: str) -> str:
+    """The figures as a page of docs."""
+    lines = [
+        "# Do the stated uncertainties hold?",
+        "",
+        f"Made by `{command}`: {found['captures']} captures of {found['scene']} at half its size, each with its own",
+        "noise, shutter errors, corners, lens and pose; draft with 16 samples, depth 8, a map 256 texels wide.",
+        "",
+        "`scatter`: errors about their mean over the captures, which is what variances describe. `truth`: the whole",
+        "error; what no variance holds is in it. Intervals should hold 45 to 55, 62 to 74 and 90 to 98 %. All channels",
+        "are pooled; channels and places of one capture share modes, so they count for less than their number.",
+        "",
+        "| places | against | z | 50 % | 68 % | 95 % | mean z | std z |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for kind, part in found["coverage"].items():
+        for against in ("scatter", "truth"):
+            row = part[against]
+            shares = " | ".join(
+                f"{100 * row['inside'][name]:.1f}{'' if row['holds'][name] else ' (out)'}" for name in EXPECTED
+            )
+            lines.append(f"| {kind} | {against} | {row['n']} | {shares} | {row['mean']:+.2f} | {row['std']:.2f} |")
+    lines += ["", "## z", ""]
+    for kind, part in found["coverage"].items():
+        lines += [f"{kind}, scatter and truth, per cent:", "", "```"]
+        both = [np.array(part[a]["histogram"]) / max(part[a]["n"], 1) for a in ("scatter", "truth")]
+        for low, high, first, second in zip(BINS[:-1], BINS[1:], *both, strict=True):
+            bars = [f"{100 * v:5.1f} {'#' * round(100 * v):<26.26}" for v in (first, second)]
+            lines.append(f"{low:+5.1f} to {high:+5.1f}  {bars[0]}  {bars[1]}")
+        lines += ["```", ""]
+    render, uncertainty = (found["cpu_seconds"][stage] for stage in ("render", "uncertainty"))
+    lines.append(f"CPU seconds, median, on a loaded machine: render {render:.1f}, uncertainty {uncertainty:.1f}.")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Build what is missing, then judge all there is."""
+    parser = argparse.ArgumentParser(prog="benchmarks.budget")
+    parser.add_argument("count", type=int, nargs="?", default=100)
+    parser.add_argument("--scene", type=Path, default=Path("sample_captures/scenes/desk.toml"))
+    parser.add_argument("--folder", type=Path, default=Path("build/budget"))
+    parser.add_argument("--judge", action="store_true", help="build nothing, judge what there is")
+    asked = parser.parse_args()
+    if not asked.judge:
+        scene, pictures = place_of(asked.scene, asked.folder / "radiance")
+        for number in range(asked.count):
+            if not (asked.folder / f"capture_{number:03d}.json").exists():
+                began = time.process_time()
+                build_one(scene, pictures, number, asked.folder)
+                say(f"capture {number}: {time.process_time() - began:.0f} CPU s")
+    records = [json.loads(path.read_text()) for path in sorted(asked.folder.glob("capture_???.json"))]
+    found = {
+        "scene": asked.scene.stem, "captures": len(records), "coverage": summary(records),
+        "cpu_seconds": {
+            stage: float(np.median([record["cpu_seconds"][stage] for record in records]))
+            for stage in ("render", "uncertainty")
+        },
+    }  # fmt: skip
+    (DOCS / "budget.json").write_text(json.dumps(found, indent=1) + "\n")
+    (DOCS / "budget.md").write_text(page(found, "make bench-budget"))
+    say(page(found, "make bench-budget"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,324 @@
+"""Laws of the error budget: every mode against finite differences, squares that add, scaling, no NaN at the edges."""
+
+import numpy as np
+import pytest
+from test_transport import GREY, all_rays, camera, ground, looking_down, sky, sphere
+
+from pipeline.budget import geometry, light, pixels
+from pipeline.budget.response import DIMMER, Grid, Layers, Response, Seen, points_on, rendered, share_of
+from pipeline.camera.lens import project
+from pipeline.camera.rigid import camera_points, perturb, rotation_exp
+from pipeline.conventions import latlong_directions, latlong_solid_angles
+from pipeline.light.environment import AXES, SCALE_SIGMA, irradiance, total_energy
+from pipeline.transport.scene import build_worlds
+from pipeline.transport.surfaces import material_bsdf, mesh_shape
+from pipeline.transport.variant import use_mitsuba
+from pipeline.types import BallFit, Emitter, Raster, View
+
+LAMP = np.array([0.4, 0.8, 0.447])
+
+
+def environment(rgb: np.ndarray, sigma: np.ndarray | float = 0.0, shared: str = "0 0 0") -> Raster:
+    variance = np.broadcast_to(np.square(sigma), rgb.shape)
+    channels = {**Raster.split(rgb), **Raster.split(variance, "variance"), "seen": np.ones(rgb.shape[:2])}
+    return Raster(channels, "acescg", {SCALE_SIGMA: shared})
+
+
+def lamp_of(rgb: np.ndarray, relative: float) -> Emitter:
+    height, width = rgb.shape[:2]
+    texels = np.flatnonzero((latlong_directions(height, width) @ LAMP > 0.97).ravel() & (rgb[..., 0].ravel() > 5))
+    alone = np.zeros_like(rgb)
+    alone.reshape(-1, 3)[texels] = rgb.reshape(-1, 3)[texels]
+    flux = irradiance(alone, LAMP[None] / np.linalg.norm(LAMP))[0]
+    return Emitter(
+        name="lamp_1", direction=LAMP / np.linalg.norm(LAMP), solid_angle_sr=0.1, half_angle_rad=0.2, irradiance=flux,
+        texels=texels, irradiance_sigma=relative * flux,
+    )  # fmt: skip
+
+
+def test_scale_patterns_are_the_covariance():
+    root = np.array([[0.01, 0, 0], [0.008, 0.004, 0], [0.007, -0.001, 0.003]])
+    found = light.scale_patterns(root @ root.T)
+    assert np.sum([np.outer(p.factor, p.factor) for p in found], 0) == pytest.approx(root @ root.T, rel=1e-9)
+    assert light.scale_patterns(np.zeros((3, 3))) == []
+
+
+def test_scale_joins_balance_and_what_else_is_shared():
+    joined = light.scale_covariance(np.full(3, 0.05), np.full((3, 3), 0.03**2))
+    assert joined == pytest.approx(np.full((3, 3), 0.05**2))  # 3 and 4 %, each in all channels alike
+
+
+def test_shared_part_is_taken_off_the_texels():
+    rgb = sky()
+    whole = environment(rgb, 0.05 * rgb, "0.03 0.03 0.03")
+    assert light.own_sigma(whole, light.shared_sigma_of(whole)) == pytest.approx(0.04 * rgb, rel=1e-6)
+
+
+def test_lobes_carry_the_variance_of_irradiance():
+    """Against irradiance under 400 maps whose cells err independently; 400 draws tell a sigma to 3.5 %.
+
+    Lobes are fitted to the six axes together; normals between them see up to a tenth more or less.
+    """
+    height, width = 64, 128
+    rgb, random = np.ones((height, width, 3)), np.random.default_rng(1)
+    found = light.sky_patterns(environment(rgb, 0.1), [], np.zeros(3))
+    assert len(found) == 6
+    normals = np.array([[0, 1, 0], [1, 0, 0], [0.6, 0.8, 0]])
+    stated = np.sqrt(np.sum([irradiance(p.radiance, normals) ** 2 for p in found], 0))[:, 0]
+    rows = round(height * light.ALIKE_DEG / 180)
+    assert rows == 1
+    directions = latlong_directions(height, width)
+    cosine = np.maximum(np.einsum("hwc,nc->nhw", directions, normals), 0) * latlong_solid_angles(height, width)
+    parts = []
+    for row in range(height):  # cells as wide as high on the sphere
+        columns = max(1, round(1 / np.sqrt(1 - directions[row, 0, 1] ** 2)))
+        parts.append(np.add.reduceat(cosine[:, row], np.arange(0, width, columns), 1))
+    cells = np.concatenate(parts, 1)
+    drawn = (0.1 * random.standard_normal((400, cells.shape[1])) @ cells.T).std(0)
+    assert stated == pytest.approx(drawn, rel=0.1 + 2 * 0.035)
+
+
+def test_flux_pattern_is_the_emitters_sigma():
+    rgb = sky()
+    lamp = lamp_of(rgb, 0.02)
+    (pattern,) = light.flux_patterns(environment(rgb), [lamp], np.zeros(3))
+    assert irradiance(pattern.radiance, lamp.direction[None])[0] == pytest.approx(lamp.irradiance_sigma, rel=1e-6)
+    assert 0 < pattern.bound < 0.02
+    recovered = lamp.model_copy(update={"evidence": "recovered"})
+    (pattern,) = light.flux_patterns(environment(rgb), [recovered], np.full(3, 0.012))
+    assert irradiance(pattern.radiance, lamp.direction[None])[0] == pytest.approx(0.8 * lamp.irradiance_sigma, rel=1e-6)
+
+
+def test_a_turned_map_is_the_light_from_elsewhere():
+    rgb, turn = sky(), np.array([0.05, -0.1, 0.03])
+    moved = light.turned(rgb, turn)
+    assert total_energy(moved) == pytest.approx(total_energy(rgb), rel=1e-12)
+    before = irradiance(rgb, AXES @ rotation_exp(turn))  # the light that came to R^T n now comes to n
+    assert irradiance(moved, AXES) == pytest.approx(before, rel=0.01)  # bilinear, lamp of eight texels
+    assert light.turned(rgb, np.zeros(3)) == pytest.approx(rgb)
+
+
+def test_ball_off_centre_turns_the_map_by_twice_its_tilt():
+    radius, sigma = 0.04, 1e-4
+    ball = BallFit(
+        centre_camera_m=[0, 0, 0.6], radius_m=radius, covariance=np.diag([sigma**2, 0, 0.0]), rms_px=0.1, points=100,
+        radius_px=80,
+    )  # fmt: skip
+    view = View(world_from_camera=np.eye(4), covariance=np.zeros((6, 6)), route="given", rms_px=0, points=0)
+    found = light.direction_covariance({"a": ball}, {"a": view})
+    assert np.sqrt(found) == pytest.approx(np.diag([0, 2 * sigma / radius, 0]))
+    # Mirrored direction by finite differences: normal at the middle of the ball's image when its centre moves by sigma.
+    normals = [np.array([-shift, 0, -np.sqrt(radius**2 - shift**2)]) / radius for shift in (0, sigma)]
+    mirrored = [np.array([0, 0, 1.0]) - 2 * n[2] * n for n in normals]
+    assert np.linalg.norm(mirrored[1] - mirrored[0]) == pytest.approx(2 * sigma / radius, rel=1e-3)
+
+
+def test_weak_patterns_are_left_out_together():
+    some = [light.Pattern(f"p{i}", "sky", bound) for i, bound in enumerate([0.1, 0.005, 0.005, 0.008])]
+    kept, left = light.worth_following(some, 0.01)
+    assert [p.name for p in kept] == ["p0", "p3"]  # 2 x 0.005^2 is 0.5 %, with 0.008^2 1.1 % of the squares
+    assert {p.name for p in left} == {"p1", "p2"}
+    assert light.worth_following(some, 0.0)[1] == []
+    assert light.worth_following([], 0.01) == ([], [])
+
+
+def joint() -> tuple[View, np.ndarray]:
+    root = (
+        np.random.default_rng(2).standard_normal((15, 15))
+        * np.repeat([1e-4, 2e-4, 0.3, 0.3, 1e-3], [3, 3, 2, 2, 5])[:, None]
+    )
+    whole = root @ root.T
+    view = View(
+        world_from_camera=looking_down(), covariance=whole[:6, :6], route="given", rms_px=0, points=9,
+        lens_covariance=whole[:6, 6:],
+    )  # fmt: skip
+    return view, whole
+
+
+def test_displacements_have_the_projected_covariance():
+    """By perturbing pose and lens along every axis of a joint covariance."""
+    view, whole = joint()
+    lens = camera().model_copy(update={"covariance": whole[6:, 6:]})
+    points = np.array([[0.05, 0.02, 0.0], [-0.1, 0, 0.1], [0.0, 0.1, 0.05]])
+    moved = geometry.displacements(lens, view, points)
+    stated = np.einsum("nim,njm->nij", moved, moved)
+    step, jacobian = 1e-6, np.zeros((3, 2, 15))
+    names = ("fx", "fy", "cx", "cy")
+    for axis in range(15):
+        pose, other = view.world_from_camera, lens
+        if axis < 6:
+            pose = perturb(pose, step * np.eye(6)[axis])
+        elif axis < 10:
+            other = lens.model_copy(update={names[axis - 6]: getattr(lens, names[axis - 6]) + step})
+        else:
+            other = lens.model_copy(update={"distortion": lens.distortion + step * np.eye(5)[axis - 10]})
+        ends = [project(c, camera_points(p, points)[0]) for c, p in ((lens, view.world_from_camera), (other, pose))]
+        jacobian[:, :, axis] = (ends[1] - ends[0]) / step
+    assert stated == pytest.approx(jacobian @ whole @ np.swapaxes(jacobian, 1, 2), rel=1e-3)
+
+
+def test_fields_keep_all_but_a_share_of_the_displacement():
+    view, whole = joint()
+    lens = camera().model_copy(update={"covariance": whole[6:, 6:]})
+    x, z = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.15, 0.15, 7), np.linspace(-0.15, 0.15, 7)))
+    points = np.stack([x, 0 * x, z], -1)
+    px = project(lens, camera_points(view.world_from_camera, points)[0])
+    found = geometry.fields(lens, view, points, px, np.arange(len(px)) % 2 == 0, 0.01)
+    assert 1 <= len(found) < 15
+    true = (geometry.displacements(lens, view, points) ** 2).sum((1, 2))
+    kept = sum(((geometry.terms(px, (48, 64)) @ f.on_ground) ** 2).sum(-1) for f in found)
+    assert kept.sum() == pytest.approx(true.sum(), rel=0.02)  # 1 % left out, the rest the quadratic's
+    given = view.model_copy(update={"covariance": np.zeros((6, 6)), "lens_covariance": None})
+    assert geometry.fields(lens, given, points, px, np.ones(len(px), bool), 0.01) == []
+
+
+def test_a_layer_that_moves_changes_by_its_slope():
+    row, column = np.mgrid[:20, :30]
+    ramp = (3.0 * column - 2.0 * row)[..., None] * np.ones(3)
+    shift = np.broadcast_to([0.2, 0.1], (20, 30, 2))
+    assert geometry.moved_by(ramp, shift) == pytest.approx(np.full((20, 30, 3), -(3 * 0.2 - 2 * 0.1)))
+
+
+def test_grid_enlarges_what_is_linear_exactly():
+    wanted = np.zeros((60, 80), bool)
+    wanted[10:50, 20:71] = True
+    grid = Grid.over(wanted, 120)
+    assert grid.step > 1
+    assert len(grid.pixels) == grid.chosen.sum() <= 1.3 * 120
+    row, column = np.divmod(grid.pixels, 80)
+    seen = grid.scattered(np.stack([row + 2.0 * column, row, column], -1))
+    big = grid.enlarged(seen)
+    rows, columns = np.mgrid[grid.window]
+    inner = np.s_[grid.step : -grid.step, grid.step : -grid.step]
+    assert big[inner] == pytest.approx(np.stack([rows + 2.0 * columns, rows, columns], -1)[inner])
+
+
+def test_share_of_what_is_too_faint_is_the_mean():
+    whole = np.zeros((8, 8, 3))
+    whole[:4] = 2.0
+    share = share_of(0.3 * whole, whole)
+    assert share == pytest.approx(np.full((8, 8, 3), 0.3))
+    assert share_of(whole, np.zeros_like(whole)) == pytest.approx(np.zeros((8, 8, 3)))
+
+
+SEEN = Seen(-np.ones((6, 6, 3)), 0.5 * np.ones((6, 6, 3)), 4 * np.ones((6, 6, 3)))
+
+
+def response() -> Response:
+    grid = Grid.over(np.ones((6, 6), bool), 100)
+    one = np.ones((6, 6, 3))
+    layers = Layers(lost=-2 * one, gained=one, obj=8 * one, on_lost=0.9 * one, on_gained=1.1 * one)
+    # Lost light meets the ground once, added light 1.5 times, a quarter of the objects' light once.
+    dim = Seen(0.8 * SEEN.lost, 0.7 * SEEN.gained, 0.95 * SEEN.obj)
+    return Response(grid, layers, SEEN, dim)
+
+
+def test_light_that_is_too_bright_as_a_whole_changes_no_shadow():
+    """Albedo is as much too low: lost light is right; of the objects' only what reaches them directly is wrong."""
+    all_of_it = Seen(0.01 * SEEN.lost, 0.01 * SEEN.gained, 0.01 * SEEN.obj)
+    found = response().of_light(all_of_it, np.full(3, 0.01))
+    assert found == pytest.approx(np.full((6, 6, 3), 0.01 * (0.75 * 8 - 0.5 * 1.1)))
+    assert response().of_factor(np.full(3, 0.01)) == pytest.approx(found)
+
+
+def test_plate_sigma_alone_where_nothing_is_inserted():
+    variance = np.full((4, 5, 3), 0.04)
+    variance[0, 0] = np.inf
+    found = pixels.plate_variance(np.ones((4, 5, 3)), variance)
+    assert np.array_equal(found, variance)
+    covered = np.ones((4, 5, 3))
+    covered[0, 0] = 0.0
+    assert pixels.plate_variance(covered, variance)[0, 0] == pytest.approx(np.zeros(3))  # the object hides the clip
+
+
+def budget_of(exposure: float) -> tuple[np.ndarray, dict]:
+    random = np.random.default_rng(5)
+    shape = (24, 32)
+    alpha = np.zeros(shape)
+    alpha[8:16, 8:16] = 1
+    plate = exposure * (1 + random.random((*shape, 3)))
+    obj = alpha[..., None] * exposure * np.array([0.8, 0.5, 0.1])
+    mul = (1 - alpha)[..., None] * np.ones(3)
+    mul[16:, :16] *= 0.6
+    composite = plate * mul + obj
+    own = {
+        "plate": pixels.plate_variance(mul, (0.01 * plate) ** 2),
+        "render": pixels.render_variance(
+            np.ones((*shape, 3)), plate, obj, np.full(shape, 0.003 * exposure), 0.02 * exposure * alpha
+        ),
+    }
+    window = np.s_[8:24, 4:20]
+    modes = [pixels.Mode("scale", "scale", 0.01 * obj[window]), pixels.Mode("p", "pose", 0.02 * composite[window])]
+    sigma = np.sqrt(pixels.total_variance(list(own.values()), modes, window))
+    return sigma, pixels.waterfall(composite, plate, alpha, own, modes, window)
+
+
+def test_twice_the_exposure_is_twice_the_sigma():
+    (one, fall), (two, other) = budget_of(1.0), budget_of(2.0)
+    assert two == pytest.approx(2 * one, rel=1e-12)
+    assert other["object"]["pixel_rel"] == pytest.approx(fall["object"]["pixel_rel"], rel=1e-9)
+    assert fall["shadow"]["unknown_pixels"] == 0
+
+
+def test_sources_of_a_waterfall_add_in_squares():
+    _, fall = budget_of(1.0)
+    for region in fall.values():
+        for column in ("pixel_rel", "mean_rel", "mean_of_change"):
+            parts = dict(region[column])
+            total = parts.pop("total")
+            assert np.sqrt(sum(value**2 for value in parts.values())) == pytest.approx(total, rel=1e-9)
+    assert fall["object"]["mean_rel"]["scale"] == pytest.approx(0.01, rel=1e-9)  # of the objects' mean
+    object_pixel, object_mean = (fall["object"][key]["render"] for key in ("pixel_rel", "mean_rel"))
+    assert object_mean == pytest.approx(object_pixel, rel=1e-9)  # 64 pixels: one tile, alike
+    assert fall["shadow"]["mean_rel"]["plate"] < 0.3 * fall["shadow"]["pixel_rel"]["plate"]  # of 128: root 5 / 128
+
+
+def test_stored_pictures_keep_infinity_and_digits():
+    kept = pixels.stored({"a": np.array([[1.5, np.inf, 0.001]])}, 10.0)["a"]
+    assert kept.dtype == np.float16
+    assert kept[0] == pytest.approx([1.5, np.inf, 0.001], rel=1e-3)
+    assert pixels.stored({"a": np.ones((1, 1))}, 1e-5)["a"].dtype == np.float32
+
+
+def test_flux_of_a_lamp_against_a_brighter_lamp():
+    """A lamp 10 % brighter over a plane whose albedo was measured under it, by brute force and by its mode.
+
+    The same random numbers in both; what is left is the second order: the lamp is 10 % brighter and gives up to two
+    thirds of the irradiance, so the first order is up to 7 % off.
+    """
+    mi, rgb, eps = use_mitsuba(), sky(), 0.1
+    lamp, albedo = lamp_of(rgb, eps), np.array([0.6, 0.5, 0.4])
+    mesh = sphere(0.08, (0.0, 0.1, 0.0), GREY)
+    grid = Grid.over(np.ones((48, 64), bool), 48 * 64)
+
+    def seen(light_map: np.ndarray, ground_albedo: np.ndarray, emitters: list[Emitter]) -> Seen:
+        shapes = {"o": mesh_shape(mi, "o", mesh, np.eye(4), material_bsdf(mi, mesh.material, "acescg"))}
+        worlds = build_worlds(ground(), ground_albedo, light_map, shapes, (), emitters)
+        return rendered(worlds, all_rays(), grid, 64, 4, 1)
+
+    (pattern,) = light.flux_patterns(environment(rgb), [lamp], np.zeros(3))
+    up = [irradiance(m, AXES[2:3])[0] for m in (rgb, pattern.radiance)]
+    share = up[1] / up[0]
+    whole, dim = seen(rgb, albedo, [lamp]), seen(rgb, DIMMER * albedo, [lamp])
+    one = np.ones(whole.obj.shape)
+    mode = Response(grid, Layers(whole.lost, whole.gained, whole.obj, one, one), whole, dim).of_light(
+        seen(pattern.radiance, albedo, [lamp]), share
+    )
+    brighter = seen(rgb + pattern.radiance, albedo / (1 + share), [lamp]).minus(whole)
+    true = brighter.lost + brighter.gained + brighter.obj
+    size = np.abs(true).max()
+    assert np.abs(mode - true).mean() < 0.01 * size
+    for part in (brighter.obj.sum(-1) != 0, brighter.lost.sum(-1) < -0.1 * size):
+        assert mode[part].mean(0) == pytest.approx(true[part].mean(0), rel=0.07)
+
+
+def test_points_that_pixels_see_project_back():
+    mi = use_mitsuba()
+    mesh = sphere(0.08, (0.0, 0.1, 0.0), GREY)
+    shapes = {"o": mesh_shape(mi, "o", mesh, np.eye(4), material_bsdf(mi, mesh.material, "acescg"))}
+    worlds = build_worlds(ground(), np.full(3, 0.5), sky(), shapes)
+    grid = Grid.over(np.ones((48, 64), bool), 48 * 64)
+    points, px, on_object = points_on(worlds, all_rays(), grid)
+    assert 0 < on_object.sum() < len(on_object)
+    assert project(camera(), camera_points(looking_down(), points)[0]) == pytest.approx(px, abs=2e-3)  # float32 rays
+    assert points[~on_object][:, 1] == pytest.approx(np.zeros((~on_object).sum()), abs=1e-5)
