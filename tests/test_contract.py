@@ -51,6 +51,7 @@ BRIDGES = {
         "pipeline/transport/paths.py",
         "pipeline/transport/trace.py",
         "pipeline/transport/variant.py",  # after mitsuba has chosen its LLVM
+        "pipeline/simulation/lens.py",  # tan of an array in a kernel
         "pipeline/simulation/photograph.py",
         "pipeline/simulation/thrown.py",
         "pipeline/simulation/twin_world.py",

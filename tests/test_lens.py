@@ -8,6 +8,7 @@ import pytest
 from pipeline.camera import lens
 from pipeline.camera.distortion import distort, distortion_jacobian, model_of, undistorted
 from pipeline.run.errors import NumericalError
+from pipeline.simulation.lens import Lens
 from pipeline.types import Camera
 
 BARREL = np.array([-0.28, 0.09, 1.2e-3, -8e-4, -0.012])
@@ -167,3 +168,19 @@ def test_regions_end_where_the_curve_turns() -> None:
         lens.unproject(camera, px)
     with pytest.raises(NumericalError, match=r"6 coefficients .* needed one of 5 \(brown\)"):
         model_of(np.zeros(6))
+
+
+@pytest.mark.parametrize("distortion", [BARREL, RATIONAL, FISHEYE], ids=["brown", "rational", "fisheye"])
+def test_the_simulators_lens_is_the_same_lens(distortion: np.ndarray) -> None:
+    """Two programs, one model: pixels agree to rounding, and rays in the single precision of a kernel to 1e-3 px."""
+    dr = pytest.importorskip("drjit")
+    camera = camera_with(distortion) if len(distortion) == 5 else wide(distortion)
+    simulated = Lens(1024, 768, camera.fx, camera.fy, camera.cx, camera.cy, tuple(distortion))
+    px = pixels_of(camera, 500)
+    rays = lens.pixel_rays(camera, px)
+    np.testing.assert_allclose(simulated.project(rays), px, atol=1e-8)
+    x, y = simulated.ideal_from_pixel(*px.T)
+    np.testing.assert_allclose(np.stack([x, y], -1), lens.unproject(camera, px), atol=1e-9)
+    u, v = (dr.llvm.Float(values.astype(np.float32)) for values in px.T)
+    traced = np.stack([np.array(values) for values in (*simulated.ideal_from_pixel(u, v), 0 * u + 1)], -1)
+    assert np.abs(lens.project(camera, traced) - px).max() < 1e-3

@@ -198,7 +198,9 @@ def capture_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]
     else:
         camera = scene.camera
         names = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
-        yield "[camera.given]", {name: getattr(camera, name) for name in names}
+        model = {4: "fisheye", 8: "rational"}.get(len(camera.distortion))
+        told = {"distortion_model": model} if model else {}
+        yield "[camera.given]", {name: getattr(camera, name) for name in names} | told
 
 
 def wish_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]]:

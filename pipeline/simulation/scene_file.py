@@ -23,7 +23,10 @@ class CameraModel(Strict):
     fy: float = Field(gt=0)
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0, 0, 0, 0, 0)
+    distortion: tuple[float, ...] = Field(
+        (0, 0, 0, 0, 0), min_length=4, max_length=8,
+        description="5: Brown's k1 k2 p1 p2 k3; 8: rational, with k4 k5 k6 behind; 4: fisheye's k1 k2 k3 k4",
+    )  # fmt: skip
     blur_sigma_px: float = Field(0.55, ge=0.29, le=0.76, description="Gaussian, the pixel's box included")
     focal_mm: float = Field(gt=0)
     fnumber: float = Field(gt=0)
