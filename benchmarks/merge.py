@@ -230,7 +230,8 @@ def real(folder: Path) -> dict[str, Any] | None:
     order = np.argsort(exposures)
     cost, _ = timed(np.ascontiguousarray(planes[order]), [exposures[i] for i in order], folder)
     merged = radiometry.merge(data.exposed([mosaics[i] for i in order], [exposures[i] for i in order]))
-    raster = Raster({"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask}, "camera_rgb")
+    mask = merged.mask.astype(np.uint32)
+    raster = Raster({"Y": merged.radiance, "variance": merged.variance, "mask": mask}, "camera_rgb")
     with cpu_seconds() as write:
         write_exr(folder / "merged.exr", raster)
     megapixels = mosaics[0].size / 1e6

@@ -264,10 +264,10 @@ def raster_of(merged: Merged, frame: Frame, profile: dict[str, Any]) -> Raster:
     """
     header = {"insitu:cfa": frame.cfa, "insitu:colour": json.dumps(profile)}
     if frame.cfa:
-        channels = {"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask}
+        channels = {"Y": merged.radiance, "variance": merged.variance, "mask": merged.mask.astype(np.uint32)}
         return Raster(channels, CAMERA_RGB, header)
     channels = Raster.split(merged.radiance) | Raster.split(merged.variance, "variance")
-    mask = np.bitwise_or.reduce(merged.mask, -1)
+    mask = np.bitwise_or.reduce(merged.mask, -1).astype(np.uint32)
     return Raster({**channels, "mask": mask}, frame.space or CAMERA_RGB, header)
 
 

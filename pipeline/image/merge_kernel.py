@@ -292,8 +292,8 @@ def _write_usual(
         spread = spread * chi2 * freedom if ghost else spread
         radiance[x] = mean
         variance[x] = spread
-        bits = np.uint32(GHOST) if ghost else np.uint32(0)
-        mask[x] = bits | (np.uint32(DARK) if mean * abs(mean) < spread else np.uint32(0))
+        bits = np.uint8(GHOST) if ghost else np.uint8(0)
+        mask[x] = bits | (np.uint8(DARK) if mean * abs(mean) < spread else np.uint8(0))
 
 
 def _sums(
@@ -468,7 +468,7 @@ def _write(work: np.ndarray, radiance: np.ndarray, variance: np.ndarray, mask: n
         radiance[x] = mean
         variance[x] = spread if seen else np.float32(np.inf)
         bits = (GHOST if chunk[COUNT + x] > zero else 0) | (DARK if mean * abs(mean) < spread else 0)
-        mask[x] = np.uint32(bits if seen else CLIPPED)
+        mask[x] = np.uint8(bits if seen else CLIPPED)
     return unseen > 0
 
 
@@ -477,5 +477,5 @@ def _bound(dn: np.ndarray, coefficient: np.ndarray, radiance: np.ndarray, mask: 
     for x in range(len(radiance)):
         j = MARGIN + x
         value = (np.float32(dn[j]) - coefficient[BLACK + j]) * coefficient[SCALE + j]
-        if mask[x] == np.uint32(CLIPPED) and value >= coefficient[LIMIT + j]:
+        if mask[x] == np.uint8(CLIPPED) and value >= coefficient[LIMIT + j]:
             radiance[x] = value

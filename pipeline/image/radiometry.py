@@ -34,7 +34,7 @@ from pipeline.image import merge_kernel
 from pipeline.image.merge_kernel import MARGIN
 from pipeline.image.noise import Noise
 
-TILE_ROWS = 16  # even, so that a tile starts on a whole CFA cell; few enough to stay in cache
+TILE_ROWS = 32  # even, so that a tile starts on a whole CFA cell; few enough to stay in cache, more than calls cost
 LIMIT_MARGIN = 0.002  # of full scale kept from the clip level: knee of the converter
 GHOST_SIGMA = 5.0  # of the chi-square, as a normal deviate: one false alarm in 3.5 million photosites
 LEAST_SHOT, LEAST_FLOOR = 1e-9, 1e-14  # of full scale: no data are better, and weights stay finite
@@ -70,7 +70,7 @@ class Exposed:
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Radiance float32 of the frames' shape, its variance, its mask (uint32 bits of conventions)."""
+    """Radiance float32 of the frames' shape, its variance, its mask (uint8, the bits of conventions)."""
 
     radiance: np.ndarray
     variance: np.ndarray
@@ -123,7 +123,7 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
     tied = len({frame.exposure for frame in frames}) < len(frames)
     ordered = sorted(frames, key=lambda frame: (frame.exposure, _digest(frame.mosaic) if tied else b""))
     shape = ordered[0].mosaic.shape
-    result = Merged(*(np.empty(shape, dtype) for dtype in (np.float32, np.float32, np.uint32)))
+    result = Merged(*(np.empty(shape, dtype) for dtype in (np.float32, np.float32, np.uint8)))
     pitch = 2 if len(shape) == 2 else shape[2]
     coefficients, bounds = _coefficients(ordered), np.array([_clip_bounds(frame) for frame in ordered])
     limits = _chi2_limits(len(ordered))
