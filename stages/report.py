@@ -38,6 +38,10 @@ TITLES = {
     "reflectance": ("What the surface reflects", "The plate over the light the probe saw, equations 6 to 8."),
     "render": ("With and without", "LS_obj and LS_noobj on the same samples; only their difference touches the plate."),
     "composite": ("Put together", "plate × mul + add + obj. Every guard that fired is counted."),
+    "uncertainty": (
+        "How far it can be trusted",
+        "What every stage is unsure of, carried to the pixels; what no sigma covers is named.",
+    ),
     "evaluate": (
         "How wrong it is",
         "Against truth where it exists; else what the estimates predict of things that stood there.",
@@ -52,14 +56,15 @@ def compute(
     exposures: dict[str, list[dict[str, Any]]], photographs: dict[str, Raster], camera: Camera, views: dict[str, View],
     balls: dict[str, BallFit], environment: Raster, harmonics: Harmonics, plane: Plane, albedo: Raster, layers: Raster,
     composite: Raster, display: np.ndarray, plate_display: np.ndarray, metrics: dict[str, Any],
-    selfcheck: dict[str, Any], error_map: Raster, balance: dict[str, Balance], records: dict[str, Any],
-    params: knobs.Report,
+    selfcheck: dict[str, Any], error_map: Raster, uncertainty: Raster, budget: dict[str, Any],
+    balance: dict[str, Balance], records: dict[str, Any], params: knobs.Report,
 ) -> Result:  # fmt: skip
     """The page as text."""
     photographs = balanced(photographs, balance)
     build = Build(
         facts, wishes, brackets, exposures, photographs, camera, views, balls, environment, harmonics, plane, albedo,
-        layers, composite, display, plate_display, metrics, selfcheck, error_map, records,
+        layers, composite, display, plate_display, metrics, selfcheck, error_map, uncertainty,
+        budget, records,
     )  # fmt: skip
     sections = [section(build, name) for name in TITLES if name in records]
     names = [wish["name"] for wish in wishes.get("object", [])]
@@ -172,7 +177,8 @@ STAGE = Stage(
         "photographs": A.PHOTOGRAPHS, "camera": A.CAMERA, "views": A.VIEWS, "balls": A.BALLS,
         "environment": A.ENVIRONMENT, "harmonics": A.HARMONICS, "plane": A.PLANE, "albedo": A.ALBEDO,
         "layers": A.LAYERS, "composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY,
-        "metrics": A.METRICS, "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "balance": A.BALANCE,
+        "metrics": A.METRICS, "selfcheck": A.SELFCHECK, "error_map": A.ERROR_MAP, "uncertainty": A.UNCERTAINTY,
+        "budget": A.BUDGET, "balance": A.BALANCE,
         "records": A.RECORDS,
     },
     outputs={"report": A.REPORT},

@@ -28,11 +28,29 @@ def inputs(tmp_path_factory):
     found["facts"]["truth_path"] = staged.write_truth(tmp_path_factory.mktemp("truth"), found, gain=0.95)
     result = evaluate.compute(**{n: found[n] for n in evaluate.STAGE.inputs}, params=knobs.Evaluate.model_validate({}))
     found |= result.outputs
+    found |= trusted(found["composite"])
     found["display"] = display_transform(found["composite"].rgb())
     found["plate_display"] = display_transform(found["photographs"]["plate"].rgb())
     frame = {"file": "p_1.dng", "label_s": 0.25, "estimated_s": 0.251, "sigma_rel": 1e-3, "clipped_fraction": 0.01}
     found |= {"brackets": {}, "exposures": {"plate": [frame]}, "records": dict.fromkeys(report.TITLES, RECORD)}
     return found
+
+
+def trusted(composite: Raster) -> dict[str, object]:
+    """An uncertainty of 2 % with one shared error, clipped in a corner, and its budget."""
+    rgb = composite.rgb()
+    sigma = 0.02 * rgb
+    sigma[:2, :2] = np.inf
+    channels = {**Raster.split(sigma, "sigma"), **Raster.split(0.01 * rgb, "mode_scale")}
+    parts = {"render": 0.012, "scale": 0.016, "total": 0.02}
+    region = {"pixels": 900, "unknown_pixels": 4, "pixel_rel": parts, "mean_rel": parts, "mean_of_change": parts}
+    return {
+        "uncertainty": Raster(channels, "acescg", {"insitu:modes": "scale"}),
+        "budget": {
+            "regions": {"object": region},
+            "not_covered": [{"stage": "probe", "term": "near field", "could_cost": "5 % of the irradiance"}],
+        },
+    }
 
 
 def page_of(found, **changes):
@@ -49,6 +67,14 @@ def test_page_is_self_contained(inputs):
     assert text.count("<section") == len(report.TITLES) + 2
     for name in report.TITLES:
         assert f'id="{name}"' in text
+
+
+def test_budget_names_its_sources_and_what_it_leaves_out(inputs):
+    text = page_of(inputs)
+    assert "scale of the light: 1.6 %" in text
+    assert "5 % of the irradiance" in text
+    bare = page_of(inputs, budget={"regions": {}, "not_covered": []})
+    assert "What no sigma covers" not in bare
 
 
 def test_errors_stand_beside_doing_nothing(inputs):

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.conventions import CLIPPED, DARK, GHOST, HOT, latlong_from_direction
 from pipeline.image import figures as fig
-from pipeline.image import pictures
+from pipeline.image import pictures, trust
 from pipeline.image.colour import convert, encode_srgb, luminance
 from pipeline.image.display import display_exposure, display_transform
 from pipeline.light import prediction, spheres
@@ -68,6 +68,8 @@ class Build:
     metrics: dict[str, Any]
     selfcheck: dict[str, Any]
     error_map: Raster
+    uncertainty: Raster
+    budget: dict[str, Any]
     records: dict[str, Any]
 
     def camera_of(self, view: str) -> Camera:
@@ -393,6 +395,11 @@ def composite_part(build: Build) -> dict[str, Any]:
     return {"figures": shown}
 
 
+def uncertainty_part(build: Build) -> dict[str, Any]:
+    """The map of sigma, the budget as a waterfall, the largest shared errors."""
+    return trust.shown(build.uncertainty, build.composite, build.budget, WIDTH)
+
+
 def evaluate_part(build: Build) -> dict[str, Any]:
     """Error maps, the table beside doing nothing, and the self-check."""
     if not build.metrics:
@@ -450,5 +457,5 @@ def waterfall(build: Build) -> list[dict[str, Any]]:
 PARTS: dict[str, Callable[[Build], dict[str, Any]]] = {
     "merge": merge_part, "develop": develop_part, "calibrate": calibrate_part, "pose": pose_part, "probe": probe_part,
     "plane": plane_part, "reflectance": reflectance_part, "render": render_part, "composite": composite_part,
-    "evaluate": evaluate_part,
+    "uncertainty": uncertainty_part, "evaluate": evaluate_part,
 }  # fmt: skip
