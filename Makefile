@@ -10,6 +10,8 @@ CAPTURE ?= sample_captures/desk
 SCENE ?=
 export INSITU_DATA ?= $(abspath ../shared/data)
 QUALITY ?=
+MAX_ERROR ?=
+TIME_BUDGET ?=
 BENCH ?=
 OUT ?= build/$(notdir $(CAPTURE:/=))
 PYTHON ?= python3
@@ -36,7 +38,8 @@ build/stages.mk: $(READY) stages/order.py $(wildcard stages/*.py) $(wildcard pip
 	@mkdir -p build && $(INSITU) rules > $@.part && mv $@.part $@
 
 $(OUT)/settings.json: FORCE | $(READY)
-	@$(INSITU) settings $(CAPTURE) --out $(OUT) $(if $(QUALITY),--quality $(QUALITY)) $(if $(SCENE),--scene $(SCENE))
+	@$(INSITU) settings $(CAPTURE) --out $(OUT) $(if $(QUALITY),--quality $(QUALITY)) $(if $(SCENE),--scene $(SCENE)) \
+		$(if $(MAX_ERROR),--max-error $(MAX_ERROR)) $(if $(TIME_BUDGET),--time-budget $(TIME_BUDGET))
 
 demo: $(OUT)/report/record.json  ## composite the bundled capture and say how good it is
 	@$(INSITU) summary $(CAPTURE) --out $(OUT)

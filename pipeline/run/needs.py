@@ -1,7 +1,15 @@
-"""What a build modelled, what it did not, on what evidence, what that could cost, and the seconds: from its records."""
+"""What a build modelled, what it did not, on what evidence, what that could cost, and the seconds: from its records.
+
+An entry of a stage's evidence may say ``saved_s``, the CPU seconds that leaving the term out saved, and ``bound_rel``,
+the most that it could cost as a share. Else seconds come from `insitu trade` of the same build, where the entry names
+the knob, and bounds from the words of ``could_cost``: the largest percentage that they name outside brackets.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -9,6 +17,10 @@ from typing import Any
 from pipeline.run.errors import ArtifactError
 from pipeline.run.runner import Build, is_complete
 
+NAMED = re.compile(r"\bknob ([a-z]+\.[a-z_]+)")
+ASIDE = re.compile(r"\([^)]*\)")
+PERCENT = re.compile(r"(\d+(?:\.\d+)?) ?%")
+NOTHING = re.compile(r"(nothing\b|0 )")  # how a text begins that says so
 MARKS = {True: "+", False: "-"}  # anything else that `modelled` says is a part: "~"
 
 
@@ -16,8 +28,11 @@ def needs(build: Build) -> dict[str, Any]:
     """Per stage: its terms with evidence and cost, seconds, and whether the record is still right.
 
     ``stages``: [{stage, seconds, cpu_seconds, stale, terms: [{term, modelled, because, could_cost}]}]; ``stale`` is
-    empty, or says why the record no longer holds. Raises ArtifactError when a stage has not run.
+    empty, or says why the record no longer holds. A term that was not modelled also has ``saved_s`` [CPU s] and
+    ``bound_rel``, each None where unknown. ``left_out``: how many those are, and over those that are known the sum of
+    the seconds, and of the bounds (and of their squares, rooted). Raises ArtifactError when a stage has not run.
     """
+    bought = bought_by_knobs(build)
     records = {stage.name: build.record(stage.name) for stage in build.graph.stages}
     if missing := [name for name, record in records.items() if record is None]:
         ran = "has" if len(missing) == 1 else "have"
@@ -31,13 +46,55 @@ def needs(build: Build) -> dict[str, Any]:
                 "seconds": record.get("seconds"),
                 "cpu_seconds": record.get("cpu_seconds"),
                 "stale": stale(build, stage.name),
-                "terms": [
-                    {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
-                    for entry in record.get("evidence") or []
-                ],
+                "terms": [told(entry, bought) for entry in record.get("evidence") or []],
             }
         )
-    return {"build": str(build.out), "quality": build.settings.quality, "stages": stages}
+    return {
+        "build": str(build.out), "quality": build.settings.quality, "stages": stages, "left_out": left_out(stages),
+    }  # fmt: skip
+
+
+def told(entry: dict[str, Any], bought: dict[str, float]) -> dict[str, Any]:
+    """An entry of evidence, and of what was not modelled the seconds saved and the bound, None where unknown."""
+    term = {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
+    if entry.get("modelled") is not False:
+        return term
+    knob = NAMED.search(str(term["because"]))
+    saved = entry.get("saved_s", bought.get(knob[1]) if knob else None)
+    return {**term, "saved_s": saved, "bound_rel": entry.get("bound_rel", bound_in(str(term["could_cost"])))}
+
+
+def bound_in(text: str) -> float | None:
+    """The largest percentage that a text names, as a share; 0 where it begins with nothing; None without either."""
+    if found := PERCENT.findall(ASIDE.sub("", text)):
+        return max(map(float, found)) / 100
+    return 0.0 if NOTHING.match(text) else None
+
+
+def bought_by_knobs(build: Build) -> dict[str, float]:
+    """CPU seconds that this build saves by each knob's value, against the base of its `insitu trade`."""
+    try:
+        trade = json.loads((build.out / "trade" / "trade.json").read_bytes())
+    except (FileNotFoundError, ValueError):
+        return {}
+    params = build.settings.params
+    found = {}
+    for row in trade.get("buys") or []:
+        stage, _, knob = row["knob"].partition(".")
+        if params.get(stage, {}).get(knob) == row["value"]:
+            found[row["knob"]] = -row["d_cpu_seconds"]
+    return found
+
+
+def left_out(stages: list[dict[str, Any]]) -> dict[str, Any]:
+    """Sums over what was not modelled; how many of the terms tell nothing."""
+    terms = [term for stage in stages for term in stage["terms"] if term["modelled"] is False]
+    bounds = [term["bound_rel"] for term in terms if term["bound_rel"] is not None]
+    saved = [term["saved_s"] for term in terms if term["saved_s"] is not None]
+    return {
+        "terms": len(terms), "bounded": len(bounds), "bound_rel_sum": math.fsum(bounds),
+        "bound_rel_root": math.hypot(0.0, *bounds), "timed": len(saved), "saved_s": math.fsum(saved),
+    }  # fmt: skip
 
 
 def how_to_run(build: Build) -> str:
@@ -78,12 +135,27 @@ def as_text(found: dict[str, Any], build: Build) -> str:
             if not known:
                 lines += wrapped("how far", term["modelled"])
             lines += wrapped("because", term["because"]) + wrapped("could cost", term["could_cost"])
+            if "saved_s" in term:
+                saved, bound = term["saved_s"], term["bound_rel"]
+                lines += wrapped("saved", "-" if saved is None else f"{saved:.1f} CPU s")
+                lines += wrapped("bound", "-" if bound is None else f"{bound:.1%}")
     terms = [term for stage in found["stages"] for term in stage["terms"]]
     counts = [sum(term["modelled"] is state for term in terms) for state in (True, False)]
     lines += ["", f"modelled {counts[0]}, not {counts[1]}, in part {len(terms) - sum(counts)}"]
+    lines.append(summed(found["left_out"]))
     if any(stage["stale"] for stage in found["stages"]):
         lines.append(f"some of this is out of date; {how_to_run(build)} renews it")
     return "\n".join(lines)
+
+
+def summed(left: dict[str, Any]) -> str:
+    """One line on what was not modelled, all together."""
+    line = (
+        f"not modelled could cost {left['bound_rel_sum']:.1%} if all bounds were met at once, "
+        f"{left['bound_rel_root']:.1%} if they were independent; "
+        f"{left['terms'] - left['bounded']} of {left['terms']} terms name no percentage"
+    )
+    return line + (f"; {left['saved_s']:.1f} CPU s saved by {left['timed']} of them" if left["timed"] else "")
 
 
 def wrapped(name: str, text: Any) -> list[str]:
