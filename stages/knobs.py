@@ -24,6 +24,9 @@ class Ingest(Params):
 class Merge(Params):
     """Merging brackets."""
 
+    frames: Literal["all", "second", "extremes"] = Field(
+        "all", description="of a bracket: all, every second, or the shortest and the longest"
+    )
     weights: Literal["poisson", "optimal"] = Field("optimal", description="per-sample weights")
     estimate_exposures: bool = Field(True, description="estimate exposure ratios instead of trusting labels")
     noise: Literal["stated", "measured"] = Field(

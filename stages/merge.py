@@ -23,7 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -75,6 +75,7 @@ def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.M
     own = {ball["name"]: json.dumps(ball["camera"], sort_keys=True) for ball in balls if ball.get("camera")}
     own |= {lens["name"]: "fisheye" for lens in facts.get("probe", {}).get("fisheye", [])}
 
+    brackets = {view: taken(bracket, params.frames) for view, bracket in brackets.items()}
     linear = linearise(brackets, lambda frame: read_samples(root / frame.file, frame))
 
     def decode(frame: Frame) -> Decoded:
@@ -85,6 +86,16 @@ def compute(facts: dict[str, Any], brackets: dict[str, Bracket], params: knobs.M
         return Decoded(sensor.samples, sensor.black, np.concatenate(listed))
 
     return linear.completed(merge_brackets(linear.brackets, decode, params, still, own, facts.get("noise", [])))
+
+
+def taken(bracket: Bracket, which: Literal["all", "second", "extremes"]) -> Bracket:
+    """The bracket with those frames that are merged: all, every second from the shortest, or shortest and longest.
+
+    The shortest always stays: it alone may hold the lamps. Only `insitu trade` should ask for fewer than all.
+    """
+    frames = bracket.frames
+    kept = {"all": frames, "second": frames[::2], "extremes": [*frames[:1], *frames[1:][-1:]]}[which]
+    return bracket.model_copy(update={"frames": kept})
 
 
 def merge_brackets(

@@ -14,6 +14,7 @@ from pipeline.run.errors import ManifestError
 # how well it is done (render.materials, pose.corner_sigma_px, probe.rim, ...), and reflectance.route, whose second
 # value takes minutes.
 LADDERS: dict[str, tuple[Any, ...]] = {
+    "merge.frames": ("extremes", "second", "all"),
     "merge.weights": ("poisson", "optimal"),
     "merge.estimate_exposures": (False, True),
     "develop.demosaic": ("bilinear", "malvar", "menon"),
