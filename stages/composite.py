@@ -243,8 +243,8 @@ def warnings_of(numbers: dict[str, Any], touched_px: float) -> list[str]:
         found.append(f"composite: {count} px are below zero; kind = auto avoids that")
     if count := numbers["guard_edge_of_model_px"]:
         found.append(
-            f"composite: a visible change ends at the border of the modelled local scene on {count} px; enlarge "
-            "plane.extent, or add the surface beyond it as a [[proxy]]"
+            f"composite: a visible change ends at the border of the modelled local scene on {count} px; lower "
+            "plane.left_out, raise plane.extent, or add the surface beyond it as a [[proxy]]"
         )
     count = numbers["guard_unseen_albedo_px"]
     if count > FEW * touched_px:

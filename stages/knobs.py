@@ -88,7 +88,13 @@ class Lights(Params):
 class Plane(Params):
     """The local scene's plane."""
 
-    extent: float = Field(8.0, ge=1, description="half size of the modelled rectangle in object sizes")
+    left_out: float = Field(
+        0.004, gt=0, le=0.1, description="change of light that may end at the modelled rectangle, as a fraction"
+    )
+    extent: float = Field(40.0, ge=1, description="most half size of the rectangle in radii of the objects")
+    find_proxies: Literal["evidence", "always", "never"] = Field(
+        "evidence", description="flat surfaces found in the cloud: modelled where objects change them, all, or none"
+    )
 
 
 class Reflectance(Params):
@@ -155,11 +161,13 @@ KNOBS: dict[str, type[Params]] = {
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "draft": {
         "merge": {"weights": "poisson"}, "develop": {"demosaic": "bilinear"}, "probe": {"width": 512, "supersample": 2},
-        "reflectance": {"texture_px": 512}, "render": {"samples": 8, "depth": 4, "threshold": 0.008},
+        "plane": {"left_out": 0.008, "find_proxies": "never"}, "reflectance": {"texture_px": 512},
+        "render": {"samples": 8, "depth": 4, "threshold": 0.008},
     },
     "preview": {},
     "final": {
         "develop": {"demosaic": "menon"}, "probe": {"width": 2048, "supersample": 4},
-        "reflectance": {"texture_px": 2048}, "render": {"samples": 512, "depth": 10, "threshold": 0.001},
+        "plane": {"left_out": 0.001}, "reflectance": {"texture_px": 2048},
+        "render": {"samples": 512, "depth": 10, "threshold": 0.001},
     },
 }  # fmt: skip

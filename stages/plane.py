@@ -1,13 +1,14 @@
-"""The local scene's plane, the rectangle of it that is modelled, and how surely objects stand on the spot.
+"""The local scene's plane, the rectangle of it that is modelled, how surely objects stand on it, and what stands by it.
 
 The markers define the world, so the plane is ``y = 0`` exactly; what is uncertain is where the camera stands to it.
 Covariance: the plate's pose covariance turned into the plane's tilt and offset as seen from the camera. Contact: pose
 and lens covariance, with their correlation, projected to pixels at the foot of each object. Rectangle: the board and
-every object with ``extent`` object sizes around; half the board's shorter side (a marker's side, without either a tenth
-of the camera's height) stands for the size of an object, as meshes are not read here. What lies behind the plate camera
-is cut off. Where further views were adjusted with the markers, a plane is fitted to their cloud (robust, weighted) and
-its agreement with the markers' is tested; the markers' plane stays the world's. Limits: one flat surface; objects much
-larger than the board need a larger ``extent``.
+every point at which an object can change the light by more than ``left_out``, by its bounding sphere under the map
+(`pipeline.transport.extent`); what lies behind the plate camera is cut off. Where further views were adjusted with the
+markers, a plane is fitted to their cloud (robust, weighted) and its agreement with the markers' is tested; the markers'
+plane stays the world's. Flat surfaces that stand beside it are found in the same cloud, and are modelled where the
+objects would change them. Limits: one flat surface carries the objects; what a concave object focuses may reach
+farther than the rectangle; surfaces without texture are not found.
 """
 
 from __future__ import annotations
@@ -18,11 +19,26 @@ import numpy as np
 
 from pipeline.camera.cloud_plane import AGREE_CHI2, CloudPlane, plane_of_cloud
 from pipeline.camera.lens import project, project_jacobians
+from pipeline.camera.planes_in_cloud import flat_surfaces
 from pipeline.camera.rigid import camera_points
-from pipeline.run.artifacts import CAMERA, CLOUD, FACTS, PLANE, VIEWS, WISHES
+from pipeline.run.artifacts import (
+    CAMERA,
+    CLOUD,
+    EMITTERS,
+    ENVIRONMENT,
+    FACTS,
+    PLANE,
+    PROXIES,
+    SURROUNDINGS,
+    VIEWS,
+    WISHES,
+)
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.stage import Stage
-from pipeline.types import Camera, Plane, Reconstruction, Result, View
+from pipeline.transport.beside import as_proxy, weighed
+from pipeline.transport.extent import FAR_SEEN, Standing, beyond, needed, standing
+from pipeline.transport.influence import light_on
+from pipeline.types import Camera, Emitter, Plane, Proxy, Raster, Reconstruction, Result, View
 from stages import knobs
 
 EDGE_ON_DEG, GRAZING_DEG = 1.0, 5.0  # elevation of the camera over the plane, seen from a foot: refused, warned of
@@ -31,11 +47,13 @@ NEAREST_DEPTH = (
 )
 FAR_OUTSIDE = 2.0  # frame diagonals beyond the frame, where not even a shadow returns
 BISECTIONS = 50  # to rounding
+BARE = 8.0  # sizes around a marker where no object stands
+UP = np.array([0.0, 1.0, 0.0])
 
 
 def compute(
     facts: dict[str, Any], wishes: dict[str, Any], camera: Camera, views: dict[str, View], cloud: Reconstruction,
-    params: knobs.Plane,
+    environment: Raster, emitters: list[Emitter], proxies: list[Proxy], params: knobs.Plane,
 ) -> Result:  # fmt: skip
     """Plane ``y = 0`` of the world with covariance, the modelled rectangle, and the contact uncertainty in pixels."""
     view = views["plate"]
@@ -45,41 +63,93 @@ def compute(
             f"plate: the camera is {-height:.3g} m below the marker's plane, needed above; is the board described as "
             "printed (legacy, squares), or a given pose in the wrong frame?"
         )
-    feet = {
-        wish["name"]: np.array([wish["position_m"][0], 0.0, wish["position_m"][1]]) for wish in wishes.get("object", [])
-    }
+    feet = {wish["name"]: np.array([wish["position_m"][0], 0.0, wish["position_m"][1]])
+            for wish in wishes.get("object", [])}  # fmt: skip
     warnings = check_feet(feet, camera, view)
     marked, size = marker_rectangle(facts, height)
     ground = np.array([*marked, *feet.values()]) if feet or len(marked) else np.zeros((1, 3))
-    corners, kept = modelled_rectangle(ground, params.extent * size, view)
-    if kept < 1:
-        warnings.append(
-            f"plane: the margin of the rectangle is cut to {kept:.0%} towards the plate camera, as it reached behind it"
-        )
     spots = feet or {"marker": ground.mean(0)}
     elevation = elevation_deg(view, list(spots.values()))
-    warnings += edge_on(elevation)
     contact = {name: sigma for name, spot in spots.items() if np.isfinite(sigma := contact_sigma(camera, view, spot))}
     covariance = plane_covariance(view)
-    plane = Plane(
-        normal=np.array([0.0, 1.0, 0.0]), offset_m=0.0, covariance=covariance, corners_m=corners, source=view.route,
+    deviations = np.sqrt(np.diag(covariance))
+    warnings += edge_on(elevation, view, list(spots.values()), float(np.hypot(*deviations[:2])), contact)
+    level = Plane(
+        normal=UP, offset_m=0.0, covariance=covariance, corners_m=np.zeros((4, 3)), source=view.route,
         contact_sigma_px=max(contact.values(), default=0.0),
     )  # fmt: skip
-    deviations = np.sqrt(np.diag(covariance))
+    objects = standing(wishes, level, size)
+    corners, extent = rectangle(ground, objects, size, view, camera, environment, emitters, params, warnings)
+    plane = level.model_copy(update={"corners_m": corners})
     numbers = {
         "normal_sigma_deg": float(np.degrees(np.hypot(deviations[0], deviations[1]))),
         "offset_sigma_m": float(deviations[2]),
         "contact_sigma_px": contact, "camera_height_m": height, "elevation_deg": elevation,
-        "object_size_assumed_m": size,
         "rectangle_m": [float(corners[:, 0].min()), float(corners[:, 2].min()),
                         float(corners[:, 0].max()), float(corners[:, 2].max())],
-        "margin_kept": kept,
-    }  # fmt: skip
+    } | extent  # fmt: skip
     found = plane_of_cloud(cloud, height, corners) if len(cloud.points) else None
-    shown = None
+    shown, rows, surroundings = None, None, list(proxies)
     if found is not None:
         numbers["cloud"] = shown = against_cloud(found, covariance, spots, camera, view, warnings)
-    return Result({"plane": plane}, numbers, warnings, evidence(view, shown))
+        table = beside(cloud, corners, found.uneven_m, objects, proxies, environment, emitters, camera, view, params)
+        numbers["surfaces"] = rows = [row for row, _ in table]
+        surroundings += [proxy for row, proxy in table if row["modelled"]]
+    terms = [*evidence(view, shown), extent_evidence(extent), beside_evidence(proxies, rows)]
+    return Result({"plane": plane, "surroundings": surroundings}, numbers, warnings, terms)
+
+
+def rectangle(
+    ground: np.ndarray, objects: list[Standing], size: float, view: View, camera: Camera, environment: Raster,
+    emitters: list[Emitter], params: knobs.Plane, warnings: list[str],
+) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
+    """Corners (4, 3) of what is modelled around the board and the feet (N, 3), and the figures that say why."""
+    light = light_on(UP, environment.rgb(), emitters)
+    if objects:
+        ends, reaches = needed(objects, light, params.left_out, params.extent)
+    else:
+        ends, reaches = np.array([ground.min(0) - BARE * size, ground.max(0) + BARE * size]), np.zeros(0)
+    corners, kept = modelled_rectangle(ground, ends, view)
+    if kept < 1:
+        warnings.append(
+            f"plane: the margin of the rectangle is cut to {kept:.0%} towards the plate camera, as it reached behind it"
+        )
+    border, change = beyond(corners, objects, light)
+    px = project(camera, camera_points(view.world_from_camera, border)[0])
+    shown = np.isfinite(px).all(-1) & (px >= 0).all(-1) & (px <= (camera.width, camera.height)).all(-1)
+    left = float(change[shown].max(initial=0.0))
+    if left > 2 * params.left_out:
+        warnings.append(
+            f"plane: up to {left:.1%} of the light may change at the border of the rectangle within the frame, needed "
+            f" {params.left_out:.1%}; raise plane.extent, or say with [[proxy]] where the surface ends"
+        )
+    return corners, {
+        "margin_kept": kept, "reach_m": {thing.name: float(r) for thing, r in zip(objects, reaches)},
+        "left_out_bound": left, "left_out_bound_anywhere": float(change.max(initial=0.0)),
+    }  # fmt: skip
+
+
+def beside(
+    cloud: Reconstruction, corners: np.ndarray, uneven_m: float, objects: list[Standing], proxies: list[Proxy],
+    environment: Raster, emitters: list[Emitter], camera: Camera, view: View, params: knobs.Plane,
+) -> list[tuple[dict[str, Any], Proxy]]:  # fmt: skip
+    """Flat surfaces of the cloud: what is known of each, whether it is modelled and why, and it as a proxy."""
+    table = []
+    for number, surface in enumerate(flat_surfaces(cloud, corners, uneven_m), 1):
+        row = weighed(surface, objects, proxies, environment.rgb(), emitters, camera, view)
+        if row["described"]:
+            why = f"it is proxy {row['described']}"
+        elif params.find_proxies == "never":
+            why = "plane.find_proxies = never"
+        elif row["change_max"] < params.left_out:
+            why = f"the objects change it by {row['change_max']:.2%} at most"
+        else:
+            why = ""
+        wanted = not row["described"] and params.find_proxies == "always"
+        name = f"found_{number}"
+        row |= {"name": name, "modelled": wanted or not why, "because": "" if wanted else why}
+        table.append((row, as_proxy(name, surface)))
+    return table
 
 
 def against_cloud(
@@ -159,25 +229,45 @@ def elevation_deg(view: View, spots: list[np.ndarray]) -> float:
     return float(np.degrees(min(np.arctan2(eye[1], distance) for distance in away)))
 
 
-def edge_on(elevation: float) -> list[str]:
-    """Refuse a plane seen edge-on, warn of one seen at a graze: an error of its tilt moves feet by its cotangent."""
+def edge_on(
+    elevation: float, view: View, spots: list[np.ndarray], tilt_sigma: float, contact: dict[str, float]
+) -> list[str]:
+    """Refuse a plane seen edge-on, warn of one seen at a graze, with what that costs where the objects stand.
+
+    A tilt error moves a foot along the line of sight by itself times distance over the sine of the elevation; in the
+    picture little is seen of it (the contact uncertainty), in size and shadow it is.
+    """
     text = (
         f"plate: the camera is {elevation:.1f} degrees above the plane where the objects stand, needed "
         f"{GRAZING_DEG:g}; photograph from higher up, or bring the objects nearer"
     )
     if elevation < EDGE_ON_DEG:
         raise CaptureError(text)
-    return [text] if elevation < GRAZING_DEG else []
+    if elevation >= GRAZING_DEG:
+        return []
+    eye = view.world_from_camera[:3, 3]
+    along = max(float((eye - spot) @ (eye - spot)) / eye[1] for spot in spots) * tilt_sigma
+    px = max(contact.values(), default=float("nan"))
+    return [
+        f"{text} (the tilt, known to {np.degrees(tilt_sigma):.2g} degrees, leaves a foot uncertain by "
+        f"{1000 * along:.2g} mm along the line of sight and {px:.2g} px across the picture)"
+    ]
 
 
-def modelled_rectangle(ground: np.ndarray, margin_m: float, view: View) -> tuple[np.ndarray, float]:
-    """Corners (4, 3) around points (N, 3) with a margin that ends before the camera; and the margin's share kept."""
-    (x_low, _, z_low), (x_high, _, z_high) = ground.min(0), ground.max(0)
+def modelled_rectangle(ground: np.ndarray, ends: np.ndarray, view: View) -> tuple[np.ndarray, float]:
+    """Corners (4, 3) that hold points (N, 3) and the ``ends`` (2, 3), all before the camera; the margin's share kept.
+
+    Raises CaptureError when the points themselves reach behind the camera.
+    """
+    low, high = ground.min(0), ground.max(0)
+    (x_low, _, z_low), (x_high, _, z_high) = low, high
+    below, above = np.maximum(low - ends[0], 0), np.maximum(ends[1] - high, 0)
 
     def corners(share: float) -> np.ndarray:
         # Only the sides whose way outward leads towards the camera are drawn in.
-        x_minus, z_minus = np.where(view.world_from_camera[[0, 2], 2] > 0, share, 1.0) * margin_m
-        x_plus, z_plus = np.where(view.world_from_camera[[0, 2], 2] < 0, share, 1.0) * margin_m
+        ahead = view.world_from_camera[[0, 2], 2]
+        x_minus, z_minus = np.where(ahead > 0, share, 1.0) * below[[0, 2]]
+        x_plus, z_plus = np.where(ahead < 0, share, 1.0) * above[[0, 2]]
         x0, x1, z0, z1 = x_low - x_minus, x_high + x_plus, z_low - z_minus, z_high + z_plus
         return np.array([[x0, 0, z1], [x1, 0, z1], [x1, 0, z0], [x0, 0, z0]])
 
@@ -243,17 +333,46 @@ def evidence(view: View, cloud: dict[str, Any] | None = None) -> list[dict[str, 
             "because": uneven,
             "could_cost": "contact and shadow shift by the height error times the cotangent of the light's elevation",
         },
-        {
-            "term": "further surfaces, occluders", "modelled": False, "because": "no geometry was given",
-            "could_cost": "shadows on them and their light on the objects are missing",
-        },
     ]  # fmt: skip
+
+
+def extent_evidence(extent: dict[str, Any]) -> dict[str, Any]:
+    """Why the rectangle is as large as it is."""
+    if not extent["reach_m"]:
+        because = f"no objects: {BARE:g} marker sizes around it"
+    else:
+        reaches = ", ".join(f"{name} {reach:.2f} m" for name, reach in extent["reach_m"].items())
+        because = f"by bounding spheres under the map objects change the plane within {reaches}"
+    return {
+        "term": "plane beyond the rectangle", "modelled": False, "because": because,
+        "could_cost": f"at most {extent['left_out_bound']:.2%} of the light at its border in the frame, more where a "
+        f"concave object focuses light; of what upright faces see of the ground, {FAR_SEEN:.0%} comes from the map",
+    }  # fmt: skip
+
+
+def beside_evidence(proxies: list[Proxy], surfaces: list[dict[str, Any]] | None) -> dict[str, Any]:
+    """Which further surfaces there are, and why the others are not modelled."""
+    term = {"term": "further surfaces, occluders"}
+    stated = f"{len(proxies)} described" if proxies else "no geometry was given"
+    missing = "shadows on them and their light on the objects are missing"
+    if surfaces is None:
+        return {**term, "modelled": bool(proxies), "because": stated, "could_cost": "" if proxies else missing}
+    rows = [f"{row['name']} ({1e4 * row['area_m2']:.0f} cm2, {row['distance_m']:.2f} m off, change up to "
+            f"{row['change_max']:.1%}): {row['because'] or 'modelled'}" for row in surfaces]  # fmt: skip
+    found = "; ".join(rows) or "no flat surface stands out of the cloud"
+    left = [row["change_max"] for row in surfaces if not row["modelled"] and not row["described"]]
+    cost = f"changes of up to {max(left):.1%} on surfaces left out" if left else "backs and sides that no view shows"
+    modelled = bool(proxies) or any(row["modelled"] for row in surfaces)
+    return {**term, "modelled": modelled, "because": f"{stated}; {found}", "could_cost": cost}
 
 
 STAGE = Stage(
     "plane",
     compute,
     knobs.Plane,
-    {"facts": FACTS, "wishes": WISHES, "camera": CAMERA, "views": VIEWS, "cloud": CLOUD},
-    {"plane": PLANE},
-)
+    {
+        "facts": FACTS, "wishes": WISHES, "camera": CAMERA, "views": VIEWS, "cloud": CLOUD,
+        "environment": ENVIRONMENT, "emitters": EMITTERS, "proxies": PROXIES,
+    },
+    {"plane": PLANE, "surroundings": SURROUNDINGS},
+)  # fmt: skip

@@ -209,7 +209,7 @@ STAGE = Stage(
         "environment": A.ENVIRONMENT,
         "emitters": A.EMITTERS,
         "plane": A.PLANE,
-        "proxies": A.PROXIES,
+        "proxies": A.SURROUNDINGS,
         "occluders": A.OCCLUDERS,
     },
     outputs={"albedo": A.ALBEDO, "surface": A.SURFACE, "local_proxies": A.LOCAL_PROXIES},

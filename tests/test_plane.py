@@ -11,7 +11,8 @@ from pipeline.camera.lens import project
 from pipeline.camera.resection import refine
 from pipeline.camera.rigid import camera_points, perturb
 from pipeline.run.errors import CaptureError, ManifestError
-from pipeline.types import Camera, Reconstruction, View
+from pipeline.transport.extent import FAR_SEEN
+from pipeline.types import Camera, Raster, Reconstruction, View
 from stages import knobs, plane
 
 CAMERA = Camera(width=640, height=480, fx=700, fy=700, cx=320, cy=240)
@@ -28,9 +29,17 @@ def view_of(pose: np.ndarray, **changes) -> View:
     )
 
 
-def run(pose: np.ndarray = POSE, objects: list | None = None, **params):
+SKY = Raster(Raster.split(np.ones((32, 64, 3), np.float32)), "acescg")
+
+
+def computed(facts, wishes, views, cloud=None, light=SKY, emitters=(), proxies=(), camera=CAMERA, **params):
+    given = cloud or Reconstruction(), light, list(emitters), list(proxies)
+    return plane.compute(facts, wishes, camera, views, *given, knobs.Plane(**params))
+
+
+def run(pose: np.ndarray = POSE, objects: list | None = None, **given):
     wishes = {"object": [{"name": f"thing{i}", "position_m": p} for i, p in enumerate(objects or [])]}
-    return plane.compute(FACTS, wishes, CAMERA, {"plate": view_of(pose)}, Reconstruction(), knobs.Plane(**params))
+    return computed(FACTS, wishes, {"plate": view_of(pose)}, **given)
 
 
 def test_plane_is_the_board_and_faces_up() -> None:
@@ -43,12 +52,25 @@ def test_plane_is_the_board_and_faces_up() -> None:
     assert not made.corners_m[:, 1].any()
 
 
-def test_rectangle_covers_board_and_objects_with_the_margin() -> None:
-    result = run(looking_at(CENTRE, 45, 15, 3.0), objects=[(0.4, -0.1), (0.1, 0.3)])
-    x0, z0, x1, z1 = result.numbers["rectangle_m"]
-    margin = 8 * 0.075  # half of the board's shorter side times the default extent
-    np.testing.assert_allclose([x0, z0, x1, z1], [-0.01 - margin, -0.1 - margin, 0.4 + margin, 0.3 + margin])
-    assert run(extent=2).numbers["rectangle_m"][0] == pytest.approx(-0.01 - 0.15)
+def test_rectangle_covers_board_and_objects_and_all_they_change() -> None:
+    """A ball of r = 37.5 mm that lies on the plane under an even sky: r^3 / d^3 = 0.4 % at d = 6.3 r, less r in height.
+
+    Upright faces at r see 5 % of the ground beyond 2 r / (0.05 pi) = 12.7 r, which is farther and decides.
+    """
+    far = looking_at(CENTRE, 45, 15, 3.0)
+    result = run(far, objects=[(0.4, -0.1), (0.1, 0.3)])
+    margin = 0.0375 * 2 / (np.pi * FAR_SEEN)
+    wanted = [0.1 - margin, -0.1 - margin, 0.4 + margin, 0.3 + margin]
+    np.testing.assert_allclose(result.numbers["rectangle_m"], wanted)
+    reached = np.sqrt((1 / 0.004) ** (2 / 3) - 1) * 0.0375
+    assert reached <= result.numbers["reach_m"]["thing0"] <= 1.1 * reached
+    assert result.numbers["left_out_bound"] < 0.004
+    tight = run(far, objects=[(0.4, -0.1)], extent=2)
+    assert tight.numbers["rectangle_m"][2] == pytest.approx(0.4 + 2 * 0.0375)
+    assert tight.numbers["rectangle_m"][0] == pytest.approx(-0.01)  # the board
+    assert tight.numbers["left_out_bound"] > 0.008
+    assert any("raise plane.extent" in text for text in tight.warnings)
+    assert "no objects" in run().evidence[-2]["because"]
 
 
 def test_rectangle_ends_before_the_camera() -> None:
@@ -134,12 +156,10 @@ def test_refusals() -> None:
 
 
 def test_marker_and_bare_worlds() -> None:
-    params, views = knobs.Plane(), {"plate": view_of(looking_at(np.zeros(3), 40, 0, 2.0))}
-    marked = plane.compute(
-        {"board": None, "marker": [{"side_m": 0.1}]}, {"object": []}, CAMERA, views, Reconstruction(), params
-    )
+    views = {"plate": view_of(looking_at(np.zeros(3), 40, 0, 2.0))}
+    marked = computed({"board": None, "marker": [{"side_m": 0.1}]}, {"object": []}, views)
     np.testing.assert_allclose(marked.numbers["rectangle_m"], [-0.85, -0.85, 0.85, 0.85])
-    bare = plane.compute({"board": None, "marker": None}, {"object": []}, CAMERA, views, Reconstruction(), params)
+    bare = computed({"board": None, "marker": None}, {"object": []}, views)
     assert bare.numbers["rectangle_m"][2] == pytest.approx(8 * 0.1 * 2.0 * np.cos(np.radians(40)))
 
 
@@ -148,7 +168,7 @@ def test_scale_of_the_world_does_not_matter(scale: float) -> None:
     moved = POSE.copy()
     moved[:3, 3] *= scale
     facts = {"board": {**FACTS["board"], "square_m": 0.03 * scale, "margin_m": 0.01 * scale}, "marker": None}
-    result = plane.compute(facts, {"object": []}, CAMERA, {"plate": view_of(moved)}, Reconstruction(), knobs.Plane())
+    result = computed(facts, {"object": []}, {"plate": view_of(moved)})
     np.testing.assert_allclose(result.numbers["rectangle_m"], np.array(run().numbers["rectangle_m"]) * scale)
 
 
@@ -210,7 +230,7 @@ def test_markers_against_the_cloud(offset_m: float, agrees: bool) -> None:
     """Markers on a 3 mm card are noticed, and what that costs at the foot: px = f h cos(elevation) / distance."""
     wishes = {"object": [{"name": "thing", "position_m": (CENTRE[0], CENTRE[2])}]}
     views = {"plate": view_of(POSE, covariance=COVARIANCE * 0.01)}
-    result = plane.compute(FACTS, wishes, CAMERA, views, cloud((0, 0), offset_m, 7), knobs.Plane())
+    result = computed(FACTS, wishes, views, cloud((0, 0), offset_m, 7))
     numbers = result.numbers["cloud"]
     assert numbers["agrees"] is agrees
     assert any("off the markers' plane at thing" in text for text in result.warnings) == (not agrees)

@@ -89,6 +89,10 @@ EMITTERS = Artifact(
 )
 
 PLANE = Artifact("plane", "json", "plane of the local scene and its modelled rectangle", "m", type=Plane)
+SURROUNDINGS = Artifact(
+    "surroundings", "json", "surfaces beside the plane that are modelled: those described, and found in the cloud", "m",
+    type=list[Proxy],
+)  # fmt: skip
 ALBEDO = Artifact("albedo", "raster", "albedo of the modelled rectangle, as a texture: R G B, seen (0..1)", "1", ACESCG)
 
 SURFACE = Artifact(
