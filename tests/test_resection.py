@@ -178,6 +178,10 @@ def test_collinear_and_few_points_are_refused() -> None:
         is_planar(np.outer(np.arange(6), [0.1, 0, 0.2]))
     with pytest.raises(NumericalError, match="on a line or fewer than 4"):
         is_planar(BOARD[:3])
+    row = BOARD[[0, 1, 2, 4, 5, 6]]  # five of a row and one beside it: no homography
+    pose = looking_at(CENTRE, 30, 20, 0.4)
+    with pytest.raises(NumericalError, match="too many of them on one line"):
+        resect_plane(CAMERA, row, seen(row, pose, np.random.default_rng(18)), SIGMA)
     assert is_planar(BOARD)
     assert not is_planar(SPREAD)
     nonsense = np.random.default_rng(17).uniform(0, 700, (6, 2))

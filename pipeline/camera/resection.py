@@ -7,6 +7,7 @@ are refined and compared.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,35 +59,25 @@ def robust_scale(residuals: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(residuals)))
 
 
-def minimise(
-    camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray, huber_px: float = np.inf
-) -> np.ndarray:
-    """Levenberg-Marquardt on the pose (4, 4), Huber cost. Returns the pose; a start that fits nothing comes back.
+Evaluated = tuple[float, np.ndarray, np.ndarray]  # cost, normal matrix (6, 6), gradient (6,)
 
-    A search with a finite ``huber_px`` only prepares the gate and ends early.
+
+def descend(evaluate: Callable[[np.ndarray], Evaluated], pose: np.ndarray, tolerance: float = 1e-12) -> np.ndarray:
+    """Levenberg-Marquardt on a pose (4, 4) until a step gains less than ``tolerance`` of the cost.
+
+    Returns the pose; a start that fits nothing (infinite cost) comes back.
     """
-
-    def evaluate(candidate: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        residuals, jacobian, _ = residuals_and_jacobian(camera, candidate, world_points, px)
-        size = np.maximum(np.hypot(residuals[:, 0], residuals[:, 1]), 1e-300)
-        weight = np.minimum(1.0, huber_px / size)
-        cost = float((weight * (2 - weight) * size**2).sum())  # Huber's rho, doubled
-        return (cost if np.isfinite(cost) else np.inf), weight, residuals, jacobian
-
     damping = 1e-6
-    cost, weight, residuals, jacobian = evaluate(pose)
+    cost, normal, gradient = evaluate(pose)
     if not np.isfinite(cost):
         return pose
     for _ in range(100):
-        flat, measured = (weight[:, None, None] * jacobian).reshape(-1, 6), residuals.ravel()
-        normal = flat.T @ jacobian.reshape(-1, 6)
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), flat.T @ measured)
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), gradient)
         candidate = perturb(pose, step)
-        new_cost, *rest = evaluate(candidate)
-        if new_cost <= cost:
-            done = cost - new_cost <= (1e-12 if np.isinf(huber_px) else 1e-5) * cost + 1e-18
-            pose, cost, damping = candidate, new_cost, max(damping * 0.1, 1e-12)
-            weight, residuals, jacobian = rest
+        trial = evaluate(candidate)
+        if trial[0] <= cost:
+            done = cost - trial[0] <= tolerance * cost + 1e-18
+            pose, (cost, normal, gradient), damping = candidate, trial, max(damping * 0.1, 1e-12)
             if done:
                 break
         else:
@@ -94,6 +85,27 @@ def minimise(
             if damping > 1e8:
                 break
     return pose
+
+
+def minimise(
+    camera: Camera, pose: np.ndarray, world_points: np.ndarray, px: np.ndarray, huber_px: float = np.inf
+) -> np.ndarray:
+    """The pose (4, 4) of least Huber cost, from a start that comes back when it fits nothing.
+
+    A search with a finite ``huber_px`` only prepares the gate and ends early.
+    """
+
+    def evaluate(candidate: np.ndarray) -> Evaluated:
+        residuals, jacobian, _ = residuals_and_jacobian(camera, candidate, world_points, px)
+        size = np.maximum(np.hypot(residuals[:, 0], residuals[:, 1]), 1e-300)
+        weight = np.minimum(1.0, huber_px / size)
+        cost = float((weight * (2 - weight) * size**2).sum())  # Huber's rho, doubled
+        flat = (weight[:, None, None] * jacobian).reshape(-1, 6)
+        return (
+            cost if np.isfinite(cost) else np.inf, flat.T @ jacobian.reshape(-1, 6), flat.T @ residuals.ravel(),
+        )  # fmt: skip
+
+    return descend(evaluate, pose, 1e-12 if np.isinf(huber_px) else 1e-5)
 
 
 def refine(
@@ -123,21 +135,35 @@ def refine(
     residuals, jacobian, by_lens = residuals_and_jacobian(camera, pose, world_points, px)
     squares = float((residuals[kept] ** 2).sum())
     sigma = max(sigma_px, np.sqrt(squares / max(2 * kept.sum() - 6, 1)))
-    flat, lens = jacobian[kept].reshape(-1, 6), np.concatenate(by_lens[kept])
+    by_noise, by_lens_part, with_lens = pose_covariance(jacobian[kept], by_lens[kept], camera.covariance)
+    noise = sigma**2 * by_noise
+    covariance = noise + by_lens_part
+    return Resection(pose, covariance, noise, with_lens, residuals, kept, float(sigma), squares / sigma_px**2)
+
+
+def pose_covariance(
+    jacobian: np.ndarray, by_lens: np.ndarray, lens_covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Covariances of a least squares pose: (6, 6) by noise of unit variance, (6, 6) by the lens, (6, L) with the lens.
+
+    ``jacobian`` (N, 2, 6) and ``by_lens`` (N, 2, L) are those of the residuals, whitened where points have weights of
+    their own. A lens that is held moves the pose by ``-(J^T J)^-1 J^T L``. Raises NumericalError when the points do not
+    fix the pose.
+    """
+    flat, lens = jacobian.reshape(-1, 6), np.concatenate(by_lens)
     normal = flat.T @ flat
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal / np.outer(size, size)
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e13:
         raise NumericalError(
-            f"pose: {int(kept.sum())} points do not fix six unknowns (collinear or too few), needed points spread over "
+            f"pose: {len(jacobian)} points do not fix six unknowns (collinear or too few), needed points spread over "
             "an area; show more of the board or add points"
         )
     inverse = np.linalg.inv(scaled) / np.outer(size, size)
-    lens_covariance = -inverse @ flat.T @ lens @ camera.covariance
-    noise = sigma**2 * (inverse + inverse.T) / 2
-    carried = -lens_covariance @ lens.T @ flat @ inverse
-    covariance = noise + (carried + carried.T) / 2
-    return Resection(pose, covariance, noise, lens_covariance, residuals, kept, float(sigma), squares / sigma_px**2)
+    moved = -inverse @ flat.T @ lens
+    with_lens = moved @ lens_covariance
+    by_lens_part = with_lens @ moved.T
+    return (inverse + inverse.T) / 2, (by_lens_part + by_lens_part.T) / 2, with_lens
 
 
 def planar_candidates(camera: Camera, world_points: np.ndarray, px: np.ndarray) -> list[np.ndarray]:

@@ -9,7 +9,6 @@ millimetres.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,13 +18,16 @@ from pipeline.camera.lens import project, project_jacobians
 from pipeline.camera.resection import (
     GATE,
     GATE_POINTS,
+    Evaluated,
     Resection,
+    descend,
     is_planar,
     planar_candidates,
+    pose_covariance,
     residuals_and_jacobian,
     widened,
 )
-from pipeline.camera.rigid import camera_points, difference, perturb
+from pipeline.camera.rigid import camera_points, difference
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
 
@@ -133,27 +135,16 @@ def _fit(
     pose = start
     for _ in range(3):  # the points' part of the weights moves with the pose, little
         _, whiten = _whitened(camera, pose, local, px, sigma_px, sigma_m)
-        pose = _descended(partial(_terms, camera, local, px, whiten), pose)
+        pose = descend(partial(_equations, camera, local, px, whiten), pose)
     residuals, jacobian, lens = _terms(camera, local, px, whiten, pose)
     chi2 = float((residuals**2).sum())
     factor = max(1.0, chi2 / max(2 * len(px) - 6, 1))
-    flat, by_lens = jacobian.reshape(-1, 6), np.concatenate(lens)
-    normal = flat.T @ flat
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled = normal / np.outer(size, size)
-    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e13:
-        raise NumericalError(
-            f"pose: {len(px)} points do not fix six unknowns (collinear or too few), needed points spread over an "
-            "area; add points"
-        )
-    inverse = np.linalg.inv(scaled) / np.outer(size, size)
-    moved = -inverse @ flat.T @ by_lens
-    noise = factor * (inverse + inverse.T) / 2
-    covariance = noise + moved @ camera.covariance @ moved.T
+    by_noise, by_lens, with_lens = pose_covariance(jacobian, lens, camera.covariance)
+    noise = factor * by_noise
     plain = residuals_and_jacobian(camera, pose, local, px)[0]
     sigma = float(np.sqrt(factor) * np.sqrt(np.mean(np.linalg.inv(whiten).transpose(0, 2, 1)[:, [0, 1], [0, 1]] ** 2)))
     kept = np.ones(len(px), bool)
-    return Resection(pose, covariance, noise, moved @ camera.covariance, plain, kept, sigma, chi2)
+    return Resection(pose, noise + by_lens, noise, with_lens, plain, kept, sigma, chi2)
 
 
 def _terms(
@@ -163,33 +154,7 @@ def _terms(
     return (whiten @ residuals[:, :, None])[..., 0], whiten @ by_pose, whiten @ by_lens
 
 
-def _descended(
-    terms: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]], pose: np.ndarray
-) -> np.ndarray:
-    """Levenberg-Marquardt on a pose (4, 4)."""
-    damping = 1e-6
-    residuals, jacobian, _ = terms(pose)
-    cost = float((residuals**2).sum())
-    for _ in range(100):
-        flat = jacobian.reshape(-1, 6)
-        normal = flat.T @ flat
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), flat.T @ residuals.ravel())
-        trial = perturb(pose, step)
-        new_residuals, new_jacobian, _ = terms(trial)
-        new = float((new_residuals**2).sum())
-        if np.isfinite(new) and new <= cost:
-            done = cost - new <= 1e-12 * cost + 1e-18
-            pose, cost, residuals, jacobian, damping = (
-                trial,
-                new,
-                new_residuals,
-                new_jacobian,
-                max(damping * 0.1, 1e-12),
-            )
-            if done:
-                break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    return pose
+def _equations(camera: Camera, local: np.ndarray, px: np.ndarray, whiten: np.ndarray, pose: np.ndarray) -> Evaluated:
+    residuals, jacobian, _ = _terms(camera, local, px, whiten, pose)
+    cost, flat = float((residuals**2).sum()), jacobian.reshape(-1, 6)
+    return cost if np.isfinite(cost) else np.inf, flat.T @ flat, flat.T @ residuals.ravel()
