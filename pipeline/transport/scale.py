@@ -89,4 +89,4 @@ def warning(found: Disagreement, lowest: np.ndarray) -> str | None:
         )
     else:
         said = f"99 % of the seen texels lie below {found.factor:.4f}"
-    return f"albedo: {said}; likely {found.cause}; a map {found.factor:.2f} times as bright would cure it"
+    return f"albedo: {said}; likely {found.cause}; a map {found.factor:.3g} times as bright would cure it"
