@@ -17,7 +17,7 @@ from pipeline.run.runner import Build
 from pipeline.run.settings import Settings, given, resolve
 from pipeline.trade import ask, model, pilot
 from pipeline.trade.ask import Question
-from pipeline.trade.model import FEWER_TRACED, FINEST, STARTING, Law, Setting
+from pipeline.trade.model import FEWER_TRACED, FINEST, STARTING, Setting
 from pipeline.trade.points import Point
 from pipeline.types import Raster
 from stages.knobs import KNOBS, PRESETS
@@ -32,7 +32,7 @@ RECORD = {
     ],
     "differences": {"2-8": {"object": 0.04, "shadow": 0.07}},
     "map": {"object": 0.002, "shadow": 0.015},
-    "stated": {"object": {"light": 0.004, "exposures": 0.003}, "shadow": {"light": 0.006}},
+    "stated": {"object": {"light": 0.004, "exposures": 0.003}, "shadow": {"light": 0.006, model.LAMP: 0.008}},
     "bounds": [{"stage": "probe", "term": "near field", "could_cost": "5 %"}],
     "cpu_seconds": 20.0, "wall_over_cpu": 0.7,
 }  # fmt: skip
@@ -41,20 +41,24 @@ MORE = {"samples": 32, "cpu_seconds": 6.2, "work": 2.4e6, "noise": 0.07}
 
 def longer() -> dict:
     """The record after its third render, whose picture follows the law of the first two."""
-    law = model.fitted(RECORD).sampling
-    told = {figure: math.hypot(one.at(8), one.at(32)) for figure, one in law.items()}
+    noise = model.fitted(RECORD).sampling
+    told = {figure: math.hypot(one.at(8), one.at(32)) for figure, one in noise.items()}
     return RECORD | {"renders": [*RECORD["renders"], MORE], "differences": {**RECORD["differences"], "8-32": told}}
 
 
-def test_a_law_is_found_again_from_differences_of_pictures_that_follow_it():
-    """Powers are tried in steps of 0.02; 0.44 is one of them."""
-    law = Law(0.08, 0.44)
-    apart = {(i, j): math.hypot(law.at(i), law.at(j)) for i, j in ((2, 8), (8, 32))}
-    assert model.law_of(apart) == Law(pytest.approx(0.08), pytest.approx(0.44))
-    alone = model.law_of({(2, 8): 0.1})
-    assert (alone.power, math.hypot(alone.at(2), alone.at(8))) == (0.5, pytest.approx(0.1))
+def test_noise_is_found_again_from_differences_of_pictures_that_have_it():
+    """Pictures of 8 and more samples follow n^-1/2; that of 2 has less, as a denoiser may leave it."""
+    true = {2: 0.05, 8: 0.04, 32: 0.02}
+    apart = {(i, j): math.hypot(true[i], true[j]) for i, j in ((2, 8), (8, 32))}
+    found = model.noise_of(apart)
+    assert [found.at(n) for n in true] == [pytest.approx(value) for value in true.values()]
+    assert found.at(128) == pytest.approx(0.01)
+    assert found.at(4) == pytest.approx(math.sqrt(0.05 * 0.04))  # half way between logarithms
+    alone = model.noise_of({(2, 8): 0.1})
+    assert alone.at(2) == pytest.approx(2 * alone.at(8))
+    assert math.hypot(alone.at(2), alone.at(8)) == pytest.approx(0.1)
     with pytest.raises(ValueError, match="no difference"):
-        model.law_of({})
+        model.noise_of({})
 
 
 def test_a_line_has_no_negative_part():
@@ -75,8 +79,9 @@ def test_a_whole_picture_costs_its_area_and_its_samples():
 def test_parts_add_as_squares_and_each_falls_with_its_knob():
     found = model.fitted(RECORD)
     for figure, parts in found.parts(Setting(8, 1024)).items():
-        assert parts["all"] ** 2 == pytest.approx(sum(parts[name] ** 2 for name in ("sampling", "map", "stated")))
+        assert parts["all"] == pytest.approx(math.hypot(*(value for name, value in parts.items() if name != "all")))
         assert parts["map"] == RECORD["map"][figure] / 2
+        assert parts["lamp"] == (0.004 if figure == "shadow" else 0)
         assert found.parts(Setting(32, 1024))[figure]["sampling"] == pytest.approx(parts["sampling"] / 2)
     assert found.stated == {"object": pytest.approx(0.005), "shadow": pytest.approx(0.006)}
     costs = [found.seconds(Setting(n, width)) for n, width in ((8, 512), (16, 512), (16, 1024), (512, 2048))]

@@ -202,11 +202,16 @@ def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, An
     last = pilot["renders"][-1]
     expected = last["noise"] * math.sqrt(last["samples"] / samples)
     ratio = numbers["object_noise_rel"] / expected if expected and numbers.get("object_noise_rel") else 1.0
-    anew = {figure: math.hypot(0.0, *parts.values()) for figure, parts in stated(build).items()}
+    anew = stated(build)
     found = {}
     for figure in (name for name in FIGURES if name in predicted):
         old = predicted[figure]
-        parts = {"sampling": old["sampling"] * ratio, "map": old["map"], "stated": anew[figure]}
+        parts = {
+            "sampling": old["sampling"] * ratio,
+            "map": old["map"],
+            "lamp": anew[figure].get(model.LAMP, 0.0),
+            "stated": model.without_lamp(anew[figure]),
+        }
         found[figure] = parts | {"all": math.hypot(*parts.values())}
     return found
 

@@ -3,9 +3,10 @@
 Two figures, as `insitu evaluate` has them: the relative error of object pixels, and that of the change that shadows
 and thrown light make; each the median over its pixels. The one number is the larger. Independent parts add as squares:
 
-sampling    a n^-p over the samples n, from differences of pilot renders of other samples and seeds
+sampling    noise over the samples n, from differences of pilot renders of other samples and seeds; beyond them n^-1/2
 map         c / w over the probe's width w, from two pilot renders under the map and under it at half its width
-stated      the standard uncertainties of the stages before (exposures, ball, lights, plate), the same for all settings
+lamp        the strongest lamp's stated uncertainty, likewise: 1.6, 0.7, 0.4 % at 256, 512, 1024 px on the bundled desk
+stated      the other standard uncertainties of the stages before (exposures, ball, light, plate), for all settings
 
 Of what is no more than bounded (near field, what a photograph cannot show) nothing is in it. Costs are CPU seconds of
 all threads, of the stages up to the composite.
@@ -13,6 +14,7 @@ all threads, of the stages up to the composite.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +34,9 @@ COMPOSITE, SHOWN = (0.6, 0.8), (0.5, 3.0)
 STARTING = 0.5  # CPU seconds of a render whatever its size: shapes, tables of the light
 BY_SAMPLES = 0.5  # of a pilot render of few samples: what grows with them; measured as soon as there are two
 FEWER_TRACED = 0.25  # the traced share falls with a picture's side to this power: desk at 256, 512, 1024 px
-POWERS = tuple(0.2 + 0.02 * step for step in range(26))  # of the samples; 0.5 without a denoiser
+RATE = 0.5  # noise falls with the samples to this power: variances of independent samples add
+LEAST = 1e-9  # difference of two pictures, so that logarithms exist
+LAMP = "strongest lamp"  # of what is stated, the part that falls with the map's texels
 
 
 @dataclass(frozen=True)
@@ -57,35 +61,50 @@ FINEST = Setting(SAMPLES[-1], WIDTHS[-1])
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Noise over samples: logarithms interpolated between ``anchors`` (samples, noise), and `RATE` beyond them."""
+
+    anchors: tuple[tuple[int, float], ...]
+
+    def at(self, samples: float) -> float:
+        """The noise of a picture of so many samples."""
+        (n0, m0), (n1, m1) = self.anchors[0], self.anchors[-1]
+        if samples <= n0 or samples >= n1:
+            n, m = (n0, m0) if samples <= n0 else (n1, m1)
+            return m * (samples / n) ** -RATE
+        pairs = itertools.pairwise(self.anchors)
+        (n0, m0), (n1, m1) = next(pair for pair in pairs if samples <= pair[1][0])
+        return math.exp(math.log(m0) + math.log(m1 / m0) * math.log(samples / n0) / math.log(n1 / n0))
+
+
+def noise_of(differences: Mapping[tuple[int, int], float]) -> Noise:
+    """Noise from how far pictures of n and 4 n samples or so are apart: ``d^2 = m_n^2 + m_4n^2``.
+
+    Of the last pair by `RATE`. A pair before shares a picture with the next; the rest of ``d^2`` is its first one's, at
+    least what the next has. Raises ValueError without any pair.
+    """
+    pairs = sorted(differences.items(), reverse=True)
+    if not pairs:
+        raise ValueError("noise_of: no difference")
+    (few, many), apart = pairs[0]
+    noise = max(apart, LEAST) / math.sqrt(1 + (few / many) ** (2 * RATE))
+    anchors = [(many, noise * (few / many) ** RATE), (few, noise)]
+    for (fewer, _), wider in pairs[1:]:
+        noise = max(math.sqrt(max(wider**2 - noise**2, 0.0)), noise)
+        anchors.append((fewer, noise))
+    return Noise(tuple(sorted(anchors)))
+
+
+@dataclass(frozen=True)
 class Law:
-    """``scale * n ** -power``."""
+    """``scale * n ** power``."""
 
     scale: float
     power: float
 
     def at(self, n: float) -> float:
         """The value at n."""
-        return self.scale * n**-self.power
-
-
-def law_of(differences: Mapping[tuple[int, int], float]) -> Law:
-    """The law of which pictures of so many samples differ by this much: ``d_ij^2 = m_i^2 + m_j^2``.
-
-    Least squares of logarithms over `POWERS`; of a single difference the power is 1/2. Raises ValueError without any.
-    """
-    known = {pair: max(value, 1e-9) for pair, value in differences.items()}
-    if not known:
-        raise ValueError("law_of: no difference")
-    best: tuple[float, Law] | None = None
-    for power in POWERS if len(known) > 1 else (0.5,):
-        shapes = {pair: math.hypot(*(n**-power for n in pair)) for pair in known}
-        logs = [math.log(value / shapes[pair]) for pair, value in known.items()]
-        middle = math.fsum(logs) / len(logs)
-        miss = math.fsum((log - middle) ** 2 for log in logs)
-        if best is None or miss < best[0] - 1e-12:
-            best = miss, Law(math.exp(middle), power)
-    assert best is not None
-    return best[1]
+        return self.scale * n**self.power
 
 
 def line_of(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -104,22 +123,24 @@ def line_of(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
 class Model:
     """A capture's laws. Built by `fitted`."""
 
-    sampling: dict[str, Law]  # figure -> law over samples
+    sampling: dict[str, Noise]  # figure -> noise over samples
     width: int  # of the pilot's map
     map_error: dict[str, float]  # figure -> error at that width
+    lamp: dict[str, float]  # figure -> standard uncertainty at that width
     stated: dict[str, float]  # figure -> standard uncertainty
     stages: dict[str, float]  # CPU seconds of the pilot's stages
-    work: Law  # pixel samples of a whole render, with a negative power
+    work: Law  # pixel samples of a whole render
     render: tuple[float, float]  # CPU seconds of a whole render, and per pixel sample
     megapixels: float
 
     def parts(self, setting: Setting) -> dict[str, dict[str, float]]:
-        """Figure -> {sampling, map, stated, all}."""
+        """Of each figure {sampling, map, lamp, stated, all}."""
         found = {}
-        for figure, law in self.sampling.items():
+        for figure, noise in self.sampling.items():
             parts = {
-                "sampling": law.at(setting.samples),
+                "sampling": noise.at(setting.samples),
                 "map": self.map_error.get(figure, 0.0) * self.width / setting.width,
+                "lamp": self.lamp.get(figure, 0.0) * self.width / setting.width,
                 "stated": self.stated.get(figure, 0.0),
             }
             found[figure] = parts | {"all": math.hypot(*parts.values())}
@@ -152,22 +173,33 @@ def fitted(pilot: Mapping[str, Any]) -> Model:
     """The model of a pilot's record (see `pipeline.trade.pilot`): JSON, so pairs of samples are texts, "2-8"."""
     sampling = {}
     for figure in FIGURES:
-        known = {
-            pair: values[figure] for pair, values in pilot["differences"].items() if values.get(figure) is not None
-        }
-        if known:
-            sampling[figure] = law_of({(int((ns := pair.split("-"))[0]), int(ns[1])): d for pair, d in known.items()})
+        apart = {pair_of(pair): values[figure] for pair, values in pilot["differences"].items()}
+        if known := {pair: value for pair, value in apart.items() if value is not None}:
+            sampling[figure] = noise_of(known)
+    stated = pilot["stated"]
     works = [(run["samples"], run["work"] * pilot["scale"] ** (2 - FEWER_TRACED)) for run in pilot["renders"]]
     return Model(
         sampling=sampling,
         width=pilot["width"],
         map_error={figure: value for figure, value in pilot["map"].items() if value is not None},
-        stated={figure: math.hypot(0.0, *parts.values()) for figure, parts in pilot["stated"].items()},
+        lamp={figure: parts.get(LAMP, 0.0) for figure, parts in stated.items()},
+        stated={figure: without_lamp(parts) for figure, parts in stated.items()},
         stages=pilot["stages"],
         work=growth_of(works),
         render=price_of([(run["work"], run["cpu_seconds"]) for run in pilot["renders"][1:]], pilot["scale"]),
         megapixels=pilot["megapixels"],
     )
+
+
+def pair_of(text: str) -> tuple[int, int]:
+    """(2, 8) of "2-8"."""
+    few, many = text.split("-")
+    return int(few), int(many)
+
+
+def without_lamp(stated: Mapping[str, float]) -> float:
+    """Standard uncertainties together, but for the lamp's."""
+    return math.hypot(0.0, *(value for name, value in stated.items() if name != LAMP))
 
 
 def price_of(renders: Sequence[tuple[float, float]], scale: int) -> tuple[float, float]:
@@ -187,7 +219,7 @@ def growth_of(works: Sequence[tuple[float, float]]) -> Law:
     """The power law of pixel samples over samples, through the first and the last render; at most proportional."""
     (n0, w0), (n1, w1) = works[0], works[-1]
     power = min(math.log(w1 / w0) / math.log(n1 / n0), 1.0) if n1 > n0 else 1.0
-    return Law(w1 / n1**power, -power)
+    return Law(w1 / n1**power, power)
 
 
 def candidates(fixed: Mapping[str, Any]) -> list[Setting]:

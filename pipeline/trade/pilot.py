@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.image import metrics
 from pipeline.run.artifacts import CAMERA, EMITTERS, HARMONICS, PHOTOGRAPHS
 from pipeline.run.runner import Build
-from pipeline.trade.model import Setting
+from pipeline.trade.model import LAMP, Setting
 from pipeline.types import Camera, Occluder, Raster
 
 LONGEST_PX = 512  # of the pilot's pictures
@@ -212,7 +212,7 @@ def stated(build: Build) -> dict[str, dict[str, float]]:
         },
         "shadow": {
             "light": light,
-            "strongest lamp": share_of(emitters[0].irradiance_sigma, emitters[0].irradiance) if emitters else 0.0,
+            LAMP: share_of(emitters[0].irradiance_sigma, emitters[0].irradiance) if emitters else 0.0,
             "plate's noise": noise_of(build.value(PHOTOGRAPHS)["plate"]) / BOXED,
             "plate's interpolation": float(interpolated) / BOXED,
         },
