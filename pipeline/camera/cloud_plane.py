@@ -57,8 +57,8 @@ def in_world(made: Reconstruction, done: Adjusted, cameras: list[Camera]) -> Rec
     )  # fmt: skip
 
 
-def point_information(made: Reconstruction) -> np.ndarray:
-    """(M, 3, 3) inverse covariance of the cloud's points, of triangulation alone, in its frame."""
+def point_covariances(made: Reconstruction) -> np.ndarray:
+    """(M, 3, 3) covariance of the cloud's points, of triangulation alone, in its frame."""
     focal = np.array([(camera.fx + camera.fy) / 2 for camera in made.cameras])[made.camera_of]
     away = made.points[made.seen_point] - made.world_from_camera[made.seen_view, :3, 3]
     depth = np.linalg.norm(away, axis=1)
@@ -66,14 +66,14 @@ def point_information(made: Reconstruction) -> np.ndarray:
     weight = (focal[made.seen_view] / (TRACK_SIGMA_PX * np.maximum(depth, 1e-300))) ** 2
     information = np.zeros((len(made.points), 3, 3))
     np.add.at(information, made.seen_point, weight[:, None, None] * (np.eye(3) - ray[:, :, None] * ray[:, None, :]))
-    return information
-
-
-def variance_along(information: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Variance (M,) of points with inverse covariances (M, 3, 3) along a unit direction (3,)."""
     values, vectors = np.linalg.eigh(information)
-    along = np.einsum("nij,i->nj", vectors, direction) ** 2
-    return np.asarray((along / np.maximum(values, 1e-12 * values[:, 2:] + 1e-300)).sum(-1))
+    least = np.maximum(values, 1e-12 * values[:, 2:] + 1e-300)  # along a single sight line nothing is known
+    return np.asarray((vectors / least[:, None]) @ vectors.transpose(0, 2, 1))
+
+
+def variance_along(covariances: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Variance (M,) of points with covariances (M, 3, 3) along a unit direction (3,)."""
+    return np.asarray(np.einsum("nij,i,j->n", covariances, direction, direction, optimize=True))
 
 
 def fit_plane(points: np.ndarray, variance: np.ndarray) -> CloudPlane | None:
@@ -121,7 +121,7 @@ def plane_of_cloud(cloud: Reconstruction, camera_height_m: float, corners_m: np.
 
     The rectangle bounds x and z; points higher or lower than a tenth of the plate camera's height are left out.
     """
-    variance = variance_along(point_information(cloud), np.array([0.0, 1.0, 0.0]))
+    variance = variance_along(point_covariances(cloud), np.array([0.0, 1.0, 0.0]))
     (x0, _, z0), (x1, _, z1) = corners_m.min(0), corners_m.max(0)
     x, y, z = cloud.points.T
     kept = (x >= x0) & (x <= x1) & (z >= z0) & (z <= z1) & (np.abs(y) < BAND * camera_height_m)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.camera.cloud_plane import CloudPlane, fit_plane, point_information, variance_along
+from pipeline.camera.cloud_plane import CloudPlane, fit_plane, point_covariances, variance_along
 from pipeline.types import Reconstruction
 
 FEWEST = 24  # points of a surface: a chance plane among neighbours rarely has half as many
@@ -68,8 +68,8 @@ def flat_surfaces(cloud: Reconstruction, corners_m: np.ndarray, uneven_m: float)
     ``corners_m`` (4, 3): the modelled rectangle; what stands farther off than half its size is no local scene.
     ``uneven_m``: standard deviation of the plane's own heights. One seed: the same cloud gives the same surfaces.
     """
-    information = point_information(cloud)
-    spread = np.sqrt(variance_along(information, np.array([0.0, 1.0, 0.0])) + uneven_m**2)
+    covariances = point_covariances(cloud)
+    spread = np.sqrt(variance_along(covariances, np.array([0.0, 1.0, 0.0])) + uneven_m**2)
     low, high = corners_m.min(0), corners_m.max(0)
     margin = (high - low).max() / 2
     points = cloud.points
@@ -79,22 +79,22 @@ def flat_surfaces(cloud: Reconstruction, corners_m: np.ndarray, uneven_m: float)
     everything, rng = left, np.random.default_rng(SEED)
     found: list[Found] = []
     while len(left) >= FEWEST and len(found) < MOST:
-        members = _largest(points, information, left, rng)
+        members = _largest(points, covariances, left, rng)
         if len(members) < FEWEST:
             break
         left = np.setdiff1d(left, members)
-        surface = _outlined(cloud, information, members)
+        surface = _outlined(cloud, covariances, members)
         if surface is not None and _is_clear(points[everything], surface):
             found.append(surface)
             left = left[~_strays(points[left], surface)]
     return found
 
 
-def _largest(points: np.ndarray, information: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _largest(points: np.ndarray, covariances: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Indices of the largest connected part of the best proposal among the points ``left``; few when there is none."""
     from scipy.spatial import cKDTree
 
-    here, within = points[left], information[left]
+    here, within = points[left], covariances[left]
     tree = cKDTree(here)
     away, neighbours = tree.query(here, min(NEAREST, len(here)))
     spacing = float(np.median(away[:, 1:4]))
@@ -119,9 +119,9 @@ def _largest(points: np.ndarray, information: np.ndarray, left: np.ndarray, rng:
     return np.asarray(left[best[_connected(here[best])]])
 
 
-def _on(points: np.ndarray, information: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _on(points: np.ndarray, covariances: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """(N,) bool: points on a plane within their own uncertainty."""
-    sigma = np.sqrt(variance_along(information, normal))
+    sigma = np.sqrt(variance_along(covariances, normal))
     return np.asarray(np.abs((points - origin) @ normal) < GATE * np.maximum(sigma, np.median(sigma)))
 
 
@@ -145,7 +145,7 @@ def _connected(points: np.ndarray) -> np.ndarray:
     return np.flatnonzero(label == np.bincount(label).argmax())
 
 
-def _outlined(cloud: Reconstruction, information: np.ndarray, members: np.ndarray) -> Found | None:
+def _outlined(cloud: Reconstruction, covariances: np.ndarray, members: np.ndarray) -> Found | None:
     """The surface through some points: fit, side that its cameras are on, upright outline; None when they span none."""
     points = cloud.points[members]
     middle, normal = _spanned(points)
@@ -153,7 +153,7 @@ def _outlined(cloud: Reconstruction, information: np.ndarray, members: np.ndarra
     if (cloud.world_from_camera[views, :3, 3].mean(0) - middle) @ normal < 0:
         normal = -normal
     frame = upright(normal)
-    fit = fit_plane((points - middle) @ frame.T, variance_along(information[members], normal))
+    fit = fit_plane((points - middle) @ frame.T, variance_along(covariances[members], normal))
     if fit is None:
         return None
     frame = upright(frame.T @ _unit(np.array([-fit.fit[1], 1.0, fit.fit[0]])))
