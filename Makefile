@@ -78,6 +78,7 @@ trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/
 
 speed: trade  ## regenerate docs/speed.md and its picture from the trade of CAPTURE
 	@cp $(OUT)/trade/trade.md docs/speed.md && cp $(OUT)/trade/trade.svg docs/trade.svg
+	@mkdir -p docs/trade && cp $(OUT)/trade/presets.json docs/trade/$(notdir $(CAPTURE:/=)).json
 
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)

@@ -161,20 +161,23 @@ def about() -> dict:
 
 def test_pages_say_what_was_measured(tmp_path):
     files = page.write(tmp_path, ROWS, about())
-    assert [file.name for file in files] == ["trade.json", "trade.csv", "trade.svg", "trade.md"]
-    record = json.loads(files[0].read_text())
+    assert [file.name for file in files] == ["presets.json", "trade.json", "trade.csv", "trade.svg", "trade.md"]
+    record = json.loads(files[1].read_text())
+    told = json.loads(files[0].read_text())
+    assert set(told["presets"]) == {"draft", "preview", "final"}
+    assert told["presets"]["draft"]["cpu_seconds"] == 12.0
     on_front = {entry["label"] for entry in record["points"] if entry["front"]["changed_rel_err"]}
     assert on_front == {"render.samples=4", "draft", "render.samples=8", "probe.width=512", "composite.kind=ratio",
                         "preview", "render.samples=128", "final"}  # fmt: skip
-    with files[1].open() as file:
+    with files[2].open() as file:
         table = {line["label"]: line for line in csv.DictReader(file)}
     assert len(table) == len(ROWS)
     assert float(table["draft"]["render_cpu_seconds"]) == 12.0
     assert table["probe.width=64"]["failed"] == "no ball"
-    drawn = ET.parse(files[2]).getroot()
+    drawn = ET.parse(files[3]).getroot()
     circles = [item for item in drawn if item.tag.endswith("circle") and len(item)]
     assert len(circles) == len([r for r in ROWS if front.is_measured(r) and r["errors"]["changed_rel_err"]])
-    text = files[3].read_text()
+    text = files[4].read_text()
     assert "| `render.samples` | 8 | +0.0140 | +0.0140 | -15.0 | -7.5 | (+0) |" in text
     assert "|  | 4 |" in text  # a knob is named once
     assert "- `probe.width=64`: no ball" in text

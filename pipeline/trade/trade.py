@@ -21,7 +21,7 @@ from pipeline.run.settings import Settings
 from pipeline.run.stage import Graph
 from pipeline.trade import front, page, scores
 from pipeline.trade.points import Changes, Point, combinations, singles
-from pipeline.trade.work import Bench, Row, alone, code_of, error_of, source_of
+from pipeline.trade.work import Bench, Row, alone, code_of, digest_of, error_of, source_of
 
 PRESETS = ("draft", "preview", "final")
 REFERENCE = "final"  # stands in for the truth where there is none
@@ -209,7 +209,11 @@ def about(asked: Asked, session: Session, against: str) -> dict[str, Any]:
     import platform
 
     settings = asked.settle(asked.base, [])
+    bench = session.bench
     return {
+        "id": digest_of([bench.source, bench.code, bench.versions, settings.params])[:12],
+        "presets": {name: asked.settle(name, []).params for name in PRESETS},
+        "load": os.getloadavg()[1],
         "capture": Path(settings.capture).parent.name,
         "against": "truth" if against == "truth" else f"the {REFERENCE} preset",
         "base": asked.base,
