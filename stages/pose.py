@@ -149,10 +149,19 @@ def by_views(
     root = Path(facts["capture_root"])
     files = {photo.file for photo in view_photos}
     seen: dict[str, list[Seen]] = {}
+
+    def linear(name: str) -> np.ndarray:
+        return linear_of(root / name) if name in files else grey(photographs[name].rgb())
+
     for number, name in enumerate(reconstruction.names):
-        lens = cameras[reconstruction.camera_of[number]]
-        linear = linear_of(root / name) if name in files else grey(photographs[name].rgb())
-        seen[name] = marks_in(facts, linear, lens)[0]
+        seen[name] = marks_in(facts, linear(name), cameras[reconstruction.camera_of[number]])[0]
+    if not any(one.marker == 0 for marks in seen.values() for one in marks):
+        note = board_doubts.instead(facts, (linear(name) for name in reversed(reconstruction.names)))
+        raise CaptureError(
+            f"sfm: the {'board' if facts.get('board') else 'first marker'} is seen in none of the {len(seen)} oriented "
+            "photographs, needed two from places that differ, to bring the cloud to metres; "
+            f"{note or 'check its dictionary and id'}, or photograph it more often"
+        )
     found, numbers, cloud, said = views_of_cloud(
         reconstruction, cameras, seen, asked, tripod, facts.get("marker") or []
     )

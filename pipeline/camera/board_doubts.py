@@ -5,8 +5,9 @@ Looked at only once something has failed, as the search over all families of mar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,19 @@ def of_marker(picture: np.ndarray, marker: dict[str, Any]) -> str:
         return ""
     ids = ", ".join(str(i) for i in layout.ids[:6]) + (", ..." if len(layout.ids) > 6 else "")
     return f"it shows {layout.dictionary}, id {ids}; [marker] says {marker['dictionary']}, id {marker['id']}"
+
+
+def instead(facts: dict[str, Any], pictures: Iterable[np.ndarray]) -> str:
+    """What pictures (H, W) of linear radiance show instead of the stated board or first marker; empty for nothing.
+
+    The first few are looked at, up to the first that shows any marker.
+    """
+    for radiance in islice(pictures, LOOKED_AT):
+        picture = eight_bit(tone(radiance))
+        note = of_board([picture], facts["board"]) if facts.get("board") else of_marker(picture, facts["marker"][0])
+        if note:
+            return note
+    return ""
 
 
 def sighted(facts: dict[str, Any], route: str, radiance: np.ndarray, camera: Camera) -> Sightings:
