@@ -106,7 +106,7 @@ def test_interrupted_stage_keeps_the_best_so_far_and_the_next_run_completes_it(n
     assert toy.run(toy.build(tmp_path / "out")) == {"level": "fresh", "mean": "fresh", "seen": "fresh"}
 
 
-def test_killed_process_is_taken_up_where_it_was(whole, tmp_path):
+def test_killed_process_is_taken_up_where_it_was(whole, tmp_path, saw):
     out = tmp_path / "out"
     done = subprocess.run([sys.executable, toy.__file__, str(out), "5"], check=False, timeout=60)
     assert done.returncode == 9
@@ -114,6 +114,7 @@ def test_killed_process_is_taken_up_where_it_was(whole, tmp_path):
     toy.run(toy.build(out))
     assert toy.COMPUTED == [5, 6]  # the fifth was computed, and lost: it was killed before saving it
     assert outputs(out) == whole
+    saw("machine.killed", "exact", 0)
 
 
 @pytest.mark.parametrize("change", ["params", "code", "damage"])

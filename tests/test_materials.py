@@ -251,10 +251,11 @@ def across(count: int) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, 1.0)], -1)
 
 
-def test_clear_glass_in_a_furnace_is_invisible() -> None:
+def test_clear_glass_in_a_furnace_is_invisible(saw) -> None:
     """Every path leaves a clear solid with all its light; those of 32 vertices are cut (1e-3 of the light at most)."""
     light = seen(in_the_open(Material(transmission=1.0)), across(4096))
     np.testing.assert_allclose(light.mean(0), 1.0, atol=2e-3)
+    saw("object.glass", "exact", np.abs(light.mean(0) - 1).max())
 
 
 @pytest.mark.parametrize(("roughness", "kept"), [(0.1, 0.998), (0.2, 0.992), (0.3, 0.967), (0.5, 0.812)])
@@ -309,7 +310,7 @@ def test_half_glass_is_a_blend() -> None:
     np.testing.assert_allclose(half, (opaque + clear) / 2, rtol=1e-5, atol=1e-7)
 
 
-def test_a_solid_with_a_hole_or_turned_inwards_is_named() -> None:
+def test_a_solid_with_a_hole_or_turned_inwards_is_named(saw) -> None:
     mi = use_mitsuba()
     glass = Material(transmission=1.0)
     whole = ball(glass)
@@ -319,6 +320,7 @@ def test_a_solid_with_a_hole_or_turned_inwards_is_named() -> None:
         warnings = object_shape(mi, "vase", mesh, np.eye(4), glass, "acescg", 1.0)[1]
         assert bool(warnings) == bool(expected)
         assert all(expected in warning and "vase" in warning for warning in warnings)
+    saw("object.inverted_glass", "degraded", float(not warnings), said=warnings[0])
 
 
 SWATCHES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0]]) * 0.85 + 0.05
@@ -371,7 +373,7 @@ def test_colours_of_files_are_linear_rec709() -> None:
     )
 
 
-def test_an_emissive_mesh_lights_the_ground() -> None:
+def test_an_emissive_mesh_lights_the_ground(saw) -> None:
     """A glowing ball above a white plane: irradiance pi L (r / d)^2 below it (within a sphere's exact view factor)."""
     mi = use_mitsuba()
     lamp = Material((0.0, 0.0, 0.0), emission=(1.0, 1.0, 1.0), ior=1.001)
@@ -386,6 +388,7 @@ def test_an_emissive_mesh_lights_the_ground() -> None:
     expected = 0.5 * 2.0 * (0.1 / 0.5) ** 2
     # 0.4 %: the polyhedron's silhouette against the sphere's
     np.testing.assert_allclose(light.mean(0), expected, atol=5 * light.std() / 128 + 0.004 * expected)
+    saw("object.emissive", "exact", np.abs(light.mean(0) / expected - 1).max())
 
 
 def test_a_glowing_texture_needs_no_unique_coordinates() -> None:

@@ -215,10 +215,16 @@ def test_all_dark_view_is_flagged(capture):
     assert any("below noise" in text for text in merged.warnings)
 
 
-def test_wrong_label_is_reported(capture):
+def test_wrong_label_is_reported(capture, saw):
     write_frame(capture / "plate/8.dng", scene(), 1 / 10 * 1.4, 0.1, seed=1)
     _, merged, _ = run(capture)
-    assert any("times its label" in text for text in merged.warnings)
+    said = [text for text in merged.warnings if "times its label" in text]
+    rows = {row["file"]: row["estimated_s"] for row in merged.outputs["exposures"]["plate"]}
+    other = next(name for name in rows if name != "plate/8.dng")
+    _, actual = PLATE[9 - int(other[6])]
+    measured = rows["plate/8.dng"] / rows[other]
+    saw("exif.wrong_40", "degraded", abs(measured / (0.1 / actual) - 1), said=said[0])
+    assert "plate/8.dng" in said[0]
 
 
 def test_lower_clip_level_than_white_is_found(capture):
@@ -290,10 +296,11 @@ def test_all_problems_at_once(capture):
     assert len(text.splitlines()) == 5
 
 
-def test_missing_exposure_is_asked_for_and_taken(capture):
+def test_missing_exposure_is_asked_for_and_taken(capture, saw):
     write_frame(capture / "plate/9.dng", scene(), 0, 0.021, 1)
-    with pytest.raises(CaptureError, match=r"plate/9.dng: exposure_s missing .* \[\[exposure\]\]"):
+    with pytest.raises(CaptureError, match=r"plate/9.dng: exposure_s missing .* \[\[exposure\]\]") as refusal:
         ingest.compute(capture, None, knobs.Ingest())
+    saw("exif.missing", "refused", said=str(refusal.value))
     (capture / "capture.toml").write_text(MANIFEST + '[[exposure]]\nfiles = ["plate/9.dng"]\nexposure_s = 0.02\n')
     index = ingest.compute(capture, None, knobs.Ingest())
     assert index.outputs["brackets"]["plate"].frames[0].exposure_s == 0.02

@@ -57,13 +57,14 @@ def test_missing_decoder_is_named(tmp_path: Path) -> None:
         load_meshes(path)
 
 
-def test_zero_area_faces_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_zero_area_faces_are_left_out_and_counted(tmp_path: Path, saw) -> None:
     path = tmp_path / "a.ply"
     vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]]
     trimesh.Trimesh(vertices, [[0, 1, 2], [0, 1, 3]], process=False).export(path)
     meshes, warnings = load_meshes(path)
     assert len(meshes[0].faces) == 1
     assert "1 of 2 faces" in warnings[0]
+    saw("object.zero_area", "degraded", len(meshes[0].faces) - 1, said=warnings[0])
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.obj", "a.ply"])

@@ -131,22 +131,27 @@ def test_contact_agrees_with_re_estimated_poses() -> None:
 
 
 @pytest.mark.parametrize(("tilt", "outcome"), [(80, "fine"), (87, "warned"), (89.5, "refused")])
-def test_a_plane_seen_edge_on(tilt: float, outcome: str) -> None:
+def test_a_plane_seen_edge_on(tilt: float, outcome: str, saw) -> None:
     grazing = looking_at(CENTRE, tilt, 15, 2.0)
     if outcome == "refused":
-        with pytest.raises(CaptureError, match=r"0\.5 degrees above the plane"):
+        with pytest.raises(CaptureError, match=r"0\.5 degrees above the plane") as refusal:
             run(grazing, objects=[(CENTRE[0], CENTRE[2])])
+        saw("plane.edge_on", "refused", said=str(refusal.value))
         return
     result = run(grazing, objects=[(CENTRE[0], CENTRE[2])])
     assert result.numbers["elevation_deg"] == pytest.approx(90 - tilt)
-    assert any("degrees above the plane" in text for text in result.warnings) == (outcome == "warned")
+    said = [text for text in result.warnings if "degrees above the plane" in text]
+    assert bool(said) == (outcome == "warned")
+    if said:
+        saw("plane.grazing", "degraded", abs(result.numbers["elevation_deg"] - (90 - tilt)), said=said[0])
 
 
-def test_refusals() -> None:
+def test_refusals(saw) -> None:
     below = POSE.copy()
     below[1, 3] = -0.4
-    with pytest.raises(CaptureError, match="below the marker's plane"):
+    with pytest.raises(CaptureError, match="below the marker's plane") as refusal:
         run(below)
+    saw("plane.camera_below", "refused", said=str(refusal.value))
     with pytest.raises(ManifestError) as error:
         run(objects=[(0.3, 0.05), tuple(POSE[[0, 2], 3] * 20), (-500.0, 0.0)])
     assert len(error.value.problems) == 2

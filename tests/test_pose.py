@@ -116,11 +116,11 @@ def test_single_marker(marker_picture) -> None:
         pose.compute(absent, {"plate": raster(marker_picture)}, CAMERA, {}, Reconstruction(), [], PARAMS)
 
 
-def test_duplicated_marker_is_refused(marker_picture) -> None:
+def test_duplicated_marker_is_refused(marker_picture, saw) -> None:
     small = marker_picture[::2, ::2]
     twice = np.full((360, 480), 0.3)
     twice[:180, :240], twice[180:, 240:] = small, small
-    with pytest.raises(CaptureError, match="seen 2 times"):
+    with pytest.raises(CaptureError, match="seen 2 times") as refusal:
         pose.compute(
             facts(board=None, marker=[MARKER], ball=[]),
             {"plate": raster(twice)},
@@ -130,9 +130,10 @@ def test_duplicated_marker_is_refused(marker_picture) -> None:
             [],
             PARAMS,
         )
+    saw("marker.duplicate", "refused", said=str(refusal.value))
 
 
-def test_ambiguous_marker_is_refused_with_both_poses() -> None:
+def test_ambiguous_marker_is_refused_with_both_poses(saw) -> None:
     """A marker of 40 px, sharp enough at 0.1 px, is refused when its corners are stated to 0.5 px."""
     far = looking_at(np.zeros(3), 22, 10, 1.6)
     stage_facts, photographs = (
@@ -141,8 +142,10 @@ def test_ambiguous_marker_is_refused_with_both_poses() -> None:
     )
     view = pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [], PARAMS).outputs["views"]["plate"]
     assert error_of(view, far)[0] < 1
-    with pytest.raises(NumericalError, match=r"plate: two poses explain .* camera at \(.*\), or camera at \("):
+    two = r"plate: two poses explain .* camera at \(.*\), or camera at \("
+    with pytest.raises(NumericalError, match=two) as refusal:
         pose.compute(stage_facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose(corner_sigma_px=0.5))
+    saw("marker.twofold", "refused", said=str(refusal.value))
 
 
 def points_of(world_m: np.ndarray, px: np.ndarray) -> list[dict]:

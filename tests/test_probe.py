@@ -366,29 +366,32 @@ def lone_shot(radius_px: float, target: tuple[float, float, float], width: int =
     return shots, transform_points(invert_rigid(pose), np.array(place.ball))
 
 
-def test_small_ball_is_flagged():
+def test_small_ball_is_flagged(saw):
     shots, true = lone_shot(34.0, (0.02, 0.03, 0.01))
     found = run(shots, ("ball_a", True))
     ball = found.outputs["balls"]["ball_a"]
     assert ball.radius_px < 40
-    assert any("coarse" in warning for warning in found.warnings)
+    said = [warning for warning in found.warnings if "coarse" in warning]
     # one pixel of outline: 2.8 rad / radius on average over r < 0.9 (sqrt of the mean of 4 / (1 - r^2), and across)
-    assert direction_rms_deg(ball.centre_camera_m, true) < np.degrees(2.8 / ball.radius_px)
+    error = direction_rms_deg(ball.centre_camera_m, true) / np.degrees(2.8 / ball.radius_px)
+    saw("ball.small", "degraded", error, said=said[0])
 
 
-def test_ball_cut_by_the_frame_is_flagged_then_refused():
+def test_ball_cut_by_the_frame_is_flagged_then_refused(saw):
     shots, true = lone_shot(60.0, (0.02, 0.115, 0.01), 260)
     found = run(shots, ("ball_a", True))
-    assert any("cuts the ball" in warning for warning in found.warnings)
+    said = [warning for warning in found.warnings if "cuts the ball" in warning]
     ball = found.outputs["balls"]["ball_a"]
     # 1.5 px of outline; measured 1.1 px, towards the part of the outline that is missing
-    assert direction_rms_deg(ball.centre_camera_m, true) < np.degrees(1.5 * 2.8 / ball.radius_px)
+    error = direction_rms_deg(ball.centre_camera_m, true) / np.degrees(2.8 / ball.radius_px)
+    saw("ball.cut", "degraded", error, said=said[0])
     shots, _ = lone_shot(60.0, (0.02, 0.14, 0.01), 260)
-    with pytest.raises(CaptureError, match="frame"):
+    with pytest.raises(CaptureError, match="frame") as refusal:
         run(shots, ("ball_a", True))
+    saw("ball.cut_away", "refused", said=str(refusal.value))
 
 
-def test_ball_thirty_degrees_off_axis():
+def test_ball_thirty_degrees_off_axis(saw):
     place = Place(sky(LAMPS, 0.3), reflectance=0.8)
     pose = look_at((0.25, 0.35, 0.3), (0, RADIUS, 0))
     turn = np.radians(30)
@@ -403,7 +406,7 @@ def test_ball_thirty_degrees_off_axis():
         camera, invert_rigid(pose)[:3, :3], transform_points(invert_rigid(pose), np.array(place.ball)), RADIUS, 0.97
     )
     inner = smooth & (texel_directions(mirror, 32, 64, np.zeros((3, 3)), np.zeros((3, 3)))[0] < 0.9)
-    assert np.median(np.abs(found.values[inner] / truth[inner] - 1)) < 0.005
+    saw("ball.off_axis", "exact", np.median(np.abs(found.values[inner] / truth[inner] - 1)))
 
 
 # ---- combination ---------------------------------------------------------------------------------------------------

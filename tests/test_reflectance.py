@@ -190,11 +190,13 @@ def test_paint_is_not_taken_for_a_shadow(seed):
     assert result.numbers["unexplained_shadow_fraction"] == 0
 
 
-def test_scale_disagreement_names_factor_and_cause():
+def test_scale_disagreement_names_factor_and_cause(saw):
     light = irradiance(SKY, NORMAL[None])[0]
     everywhere = solve(plate(2.5 * smooth(where_seen()), light))
     assert everywhere.numbers["map_factor"] == pytest.approx(2.5 * 0.7, rel=0.05)
     assert "exposure between plate and ball" in everywhere.warnings[0]
+    error = abs(everywhere.numbers["map_factor"] / (2.5 * 0.7) - 1)
+    saw("albedo.above_one", "degraded", error, said=everywhere.warnings[0])
     patch = solve(plate(smooth(where_seen()) * (1 + 3 * disc(80, 60, 14)), light))
     assert "highlight" in patch.warnings[0]
     below = solve(plate(smooth(where_seen()) - 0.35, light))

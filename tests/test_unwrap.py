@@ -87,12 +87,13 @@ def test_gain_of_the_reflection_is_the_derivative():
 
 
 @pytest.mark.parametrize("distance_over_radius", [1.5, 8, 50])
-def test_solid_angles_of_pixels_sum_to_the_seen_part_of_the_sphere(distance_over_radius):
+def test_solid_angles_of_pixels_sum_to_the_seen_part_of_the_sphere(distance_over_radius, saw):
     mirror = mirror_of(120, distance_over_radius)
     total = pixel_solid_angles(mirror, slice(0, mirror.camera.height)).sum(dtype=float)
     end = reflection.deviation(np.array(0.97), mirror.ratio)
     # a jagged rim: half a pixel of error in each of 2 pi 116 rim pixels, independent, of gain 4 to 8 times the mean
     assert total == pytest.approx(2 * np.pi * (1 - np.cos(end)), rel=2e-3)
+    saw("ball.rim", "exact", abs(total / (2 * np.pi * (1 - np.cos(end))) - 1))
 
 
 # ---- energy --------------------------------------------------------------------------------------------------------
@@ -119,7 +120,7 @@ LAMPS = {
 
 @pytest.mark.parametrize("distance_over_radius", [1.5, 4, 50])
 @pytest.mark.parametrize("radius_px", [60, 250])
-def test_lamps_of_one_pixel_keep_their_energy(distance_over_radius, radius_px):
+def test_lamps_of_one_pixel_keep_their_energy(distance_over_radius, radius_px, saw):
     # Sums are conserved to rounding (next test). Means take a pixel's solid angle as even over the pixel and texels as
     # polygons: 0.1 %, and the square of the solid angle's slope s / (1 - s^2) / radius, 7 % per px at 0.9 of 60 px.
     mirror = mirror_of(radius_px, distance_over_radius)
@@ -135,6 +136,8 @@ def test_lamps_of_one_pixel_keep_their_energy(distance_over_radius, radius_px):
         sine = lamp_sine(mirror, np.array(direction))
         bound = 1e-3 + (sine / (1 - sine**2) / radius_px) ** 2
         assert map_energy(found) == pytest.approx(ball_energy(mirror, picture), rel=bound)
+        if (distance_over_radius, radius_px) == (1.5, 250):
+            saw("ball.near", "exact", abs(map_energy(found) / ball_energy(mirror, picture) - 1))
         tested += 1
     assert tested >= 2
 
@@ -348,7 +351,7 @@ def test_rim_moves_out_with_the_ball_and_in_with_its_uncertainty():
     assert usable_rim(fit_of(100, 1.0), RADIUS) < sharp[1] - 0.02
 
 
-def test_view_marks_the_blind_cone_and_invents_nothing_there():
+def test_view_marks_the_blind_cone_and_invents_nothing_there(saw):
     fit = fit_of(90, 0.05)
     focal = 90 / np.tan(np.arcsin(1 / 8))
     mirror = Mirror(Camera(width=260, height=240, fx=focal, fy=focal, cx=130, cy=120), np.eye(3), fit.centre, RADIUS, 1)
@@ -361,7 +364,7 @@ def test_view_marks_the_blind_cone_and_invents_nothing_there():
     w = latlong_directions(64, 128)
     end = reflection.deviation(np.array(usable_rim(fit, RADIUS)), 1 / 8)
     unseen = w[..., 2] > -np.cos(end + 0.08)
-    assert (got.coverage[unseen] == 0).all()
+    saw("ball.blind_cone", "degraded", np.count_nonzero(got.coverage[unseen]), said="coverage and weight of zero")
     assert (got.weight[unseen] == 0).all()
     assert (got.rgb[unseen] == 0).all()
     seen = got.coverage > 0.999
