@@ -161,20 +161,20 @@ def about() -> dict:
 
 def test_pages_say_what_was_measured(tmp_path):
     files = page.write(tmp_path, ROWS, about())
-    assert [file.name for file in files] == ["presets.json", "trade.json", "trade.csv", "trade.svg", "trade.md"]
-    record = json.loads(files[1].read_text())
-    told = json.loads(files[0].read_text())
+    assert [file.name for file in files] == ["trade.json", "trade.csv", "trade.svg", "presets.json", "trade.md"]
+    record = json.loads(files[0].read_text())
+    told = json.loads(files[3].read_text())
     assert set(told["presets"]) == {"draft", "preview", "final"}
     assert told["presets"]["draft"]["cpu_seconds"] == 12.0
     on_front = {entry["label"] for entry in record["points"] if entry["front"]["changed_rel_err"]}
     assert on_front == {"render.samples=4", "draft", "render.samples=8", "probe.width=512", "composite.kind=ratio",
                         "preview", "render.samples=128", "final"}  # fmt: skip
-    with files[2].open() as file:
+    with files[1].open() as file:
         table = {line["label"]: line for line in csv.DictReader(file)}
     assert len(table) == len(ROWS)
     assert float(table["draft"]["render_cpu_seconds"]) == 12.0
     assert table["probe.width=64"]["failed"] == "no ball"
-    drawn = ET.parse(files[3]).getroot()
+    drawn = ET.parse(files[2]).getroot()
     circles = [item for item in drawn if item.tag.endswith("circle") and len(item)]
     assert len(circles) == len([r for r in ROWS if front.is_measured(r) and r["errors"]["changed_rel_err"]])
     text = files[4].read_text()
@@ -369,7 +369,7 @@ def test_the_whole_of_a_trade_on_made_up_costs(toy, tmp_path):
     trade.explore(asked, session, Point("preview", "base", "preview"), "truth")
     kinds = [r["kind"] for r in session.rows]
     assert kinds[:3] == ["repeat", "repeat", "base"]
-    assert kinds.count("knob") == 3 + 5 + 1
+    assert kinds.count("knob") == 3 + 6 + 1
     combined = {r["label"] for r in session.rows if r["kind"] == "design"}
     assert combined == {"probe.width=256 render.samples=16", "probe.width=2048 render.samples=512"}
     assert [r["label"] for r in session.rows if r["kind"] == "knob" and r["cpu_seconds"] > 100] == [

@@ -36,10 +36,10 @@ def write(root: Path, rows: Sequence[Row], about: dict[str, Any]) -> list[Path]:
     foretold = {row["label"]: front.predicted(row["changes"], rows) for row in rows if row["kind"] == "design"}
     record = {**about, "points": rows, "buys": front.buys(rows), "predicted": foretold}
     files = {
-        "presets.json": json.dumps(presets(rows, about), indent=1) + "\n",
         "trade.json": json.dumps(record, indent=1) + "\n",
         "trade.csv": as_csv(rows),
         "trade.svg": pareto_svg(rows, front.MAIN, NAMES[front.MAIN]),
+        "presets.json": json.dumps(presets(rows, about), indent=1) + "\n",
         "trade.md": markdown(rows, about),
     }
     for name, text in files.items():
