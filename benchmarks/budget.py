@@ -1,6 +1,6 @@
 """Do the stated uncertainties hold? One place, photographed and built again and again; errors over sigma, pooled.
 
-    .venv/bin/python -m benchmarks.budget [COUNT] [--scene SCENE.toml] [--folder build/budget]
+    .venv/bin/python -m benchmarks.budget [COUNT] [--folder build/budget]
 
 Every capture (`benchmarks.resimulate`: own noise, shutter errors, corners, lens and pose) is built to the stage
 ``uncertainty`` and compared with the truth, scaled by the one factor s = median(LS_b / P) of the capture, as `evaluate`
@@ -39,6 +39,7 @@ EXPECTED = {"50": (0.45, 0.55), "68": (0.62, 0.74), "95": (0.90, 0.98)}
 QUANTILES = {"50": 0.67449, "68": 1.0, "95": 1.95996}  # of |z|, normal
 BINS = np.array([-np.inf, -3, -2.5, -2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, np.inf])
 DOCS = Path("docs/benchmarks")
+SCENES = Path("sample_captures/scenes")
 
 
 def regions(truth_plate: np.ndarray, truth: np.ndarray, coverage: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -194,12 +195,12 @@ def main() -> None:
     """Build what is missing, then judge all there is."""
     parser = argparse.ArgumentParser(prog="benchmarks.budget")
     parser.add_argument("count", type=int, nargs="?", default=100)
-    parser.add_argument("--scene", type=Path, default=Path("sample_captures/scenes/desk.toml"))
+    parser.add_argument("--capture", type=Path, default=Path("sample_captures/desk"), help="bundled, simulated")
     parser.add_argument("--folder", type=Path, default=Path("build/budget"))
     parser.add_argument("--judge", action="store_true", help="build nothing, judge what there is")
     asked = parser.parse_args()
     if not asked.judge:
-        scene, pictures = place_of(asked.scene, asked.folder / "radiance")
+        scene, pictures = place_of(SCENES / f"{asked.capture.name}.toml", asked.capture, asked.folder / "radiance")
         for number in range(asked.count):
             if not (asked.folder / f"capture_{number:03d}.json").exists():
                 began = time.process_time()
@@ -207,7 +208,7 @@ def main() -> None:
                 say(f"capture {number}: {time.process_time() - began:.0f} CPU s")
     records = [json.loads(path.read_text()) for path in sorted(asked.folder.glob("capture_???.json"))]
     found = {
-        "scene": asked.scene.stem, "captures": len(records), "coverage": summary(records),
+        "scene": asked.capture.name, "captures": len(records), "coverage": summary(records),
         "cpu_seconds": {
             stage: float(np.median([record["cpu_seconds"][stage] for record in records]))
             for stage in ("render", "uncertainty")

@@ -1,9 +1,10 @@
 """Many captures of one place: its radiance is rendered once and photographed again and again.
 
-    .venv/bin/python -m benchmarks.resimulate SCENE.toml FOLDER COUNT
+    .venv/bin/python -m benchmarks.resimulate SCENE.toml CAPTURE FOLDER COUNT
 
-A scene's pictures (plate, ball views, board photographs, truth) are rendered once, at ``SCALE`` of the scene's frame
-and with fewer samples, and kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern,
+The truth of the bundled CAPTURE that SCENE.toml made (plate, plate with objects, coverage) is brought to half its size,
+2 x 2 pixels to one, which leaves it less noise than it had; ball views and board photographs are rendered at that size.
+All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern,
 hot photosites, JPEG noise of the board photographs (so corners, lens and pose of its own) and shutter: each setting of
 the dial is off by `DIAL`, each frame by `FRAME` more. Truth is the same for all and is linked to.
 """
@@ -16,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.run.formats import write_bytes
+from pipeline.run.cli import say
+from pipeline.run.formats import read_exr, write_bytes
 from pipeline.simulation import capture, shapes
 from pipeline.simulation.lens import blur
 from pipeline.simulation.scene_file import SimulatedScene, load_scene
@@ -24,11 +26,9 @@ from pipeline.simulation.world import Place
 from pipeline.transport.variant import use_mitsuba
 from stages import simulate
 
-SCALE = 0.5  # of the frame; the same field of view
-SAMPLING = {
-    "plate": 128, "region": 1024, "change": 2048, "object": 4096, "region_pass": 1024, "ball": 256, "calibration": 64,
-    "environment": 64, "environment_width": 256,
-}  # fmt: skip
+HALF = 2  # pixels of the bundled truth along a side that become one
+SAMPLING = {"ball": 64, "calibration": 32, "environment": 64, "environment_width": 256}
+SOFT_PX = 0.4  # Gaussian on the halved truth: 0.37 px are its own, together 0.55 as the simulated lens has it
 DIAL = 0.01  # of log time, of each setting of the shutter; real ones are off by up to several percent
 FRAME = 0.002  # of log time, of each frame: what one setting repeats to
 
@@ -56,17 +56,39 @@ class Pictures:
 
 
 def reduced(scene: SimulatedScene) -> SimulatedScene:
-    """The scene at `SCALE` of its frame, with fewer samples."""
+    """The scene at half its frame, with fewer samples."""
     camera = scene.camera
     smaller = camera.model_copy(
-        update={n: SCALE * getattr(camera, n) for n in ("fx", "fy", "cx", "cy")}
-        | {n: 2 * round(SCALE * getattr(camera, n) / 2) for n in ("width", "height")}
+        update={n: getattr(camera, n) / HALF for n in ("fx", "fy", "cx", "cy")}
+        | {n: getattr(camera, n) // HALF for n in ("width", "height")}
     )
     sampling = scene.sampling.model_copy(update=SAMPLING)
     return scene.model_copy(update={"camera": smaller, "sampling": sampling})
 
 
-def render(scene: SimulatedScene, folder: Path) -> Pictures:
+def halved(values: np.ndarray) -> np.ndarray:
+    """(H / 2, W / 2, ...) means over 2 x 2 pixels, a little softened."""
+    height, width = (size // HALF for size in values.shape[:2])
+    small = values.reshape(height, HALF, width, HALF, -1).mean((1, 3)).reshape(height, width, *values.shape[2:])
+    return np.asarray(blur(np.asarray(small, float), SOFT_PX))
+
+
+def halve_truth(bundled: Path, folder: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Truth pictures of ``bundled`` at half their size, written into ``folder``; returns the plate (H, W, 3)."""
+    pictures = {}
+    for name in ("plate", "with_objects", "albedo"):
+        raster = read_exr(bundled / f"{name}.exr")
+        extra = {"seen": halved(raster["seen"][..., None])[..., 0]} if "seen" in raster.channels else {}
+        pictures[name] = halved(raster.rgb())
+        capture.write_picture(folder / f"{name}.exr", pictures[name], extra)
+    layers = {n: halved(v[..., None])[..., 0] for n, v in read_exr(bundled / "coverage.exr").channels.items()}
+    capture.write_layers(folder / "coverage.exr", layers, shape)
+    light = read_exr(bundled / "environment.exr")
+    capture.write_picture(folder / "environment.exr", light.rgb())
+    return pictures["plate"]
+
+
+def render(scene: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     """Radiance of all photographs; truth and objects are written into ``folder``. Minutes."""
     mi = use_mitsuba()
     studio = simulate.Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera))
@@ -74,18 +96,17 @@ def render(scene: SimulatedScene, folder: Path) -> Pictures:
     views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view]}
     for model in scene.object:
         shapes.write_glb(folder / "objects" / f"{model.name}.glb", shapes.build(model), model)
+    plate = halve_truth(bundled, folder / "truth", studio.shape)
+    record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, {})
+    capture.write_truth(folder / "truth" / "truth.json", record)
+    balls = {view.name: simulate.ball_picture(studio, view, say) for view in scene.ball_view}
     measure, sigma = studio.radiance(), scene.camera.blur_sigma_px
     boards = []
     for number, photo in enumerate(scene.calibration):
+        say(f"board photograph {number + 1}")
         pose = simulate.board_pose(scene, studio.lens, photo)
-        boards.append(
-            blur(studio.photograph(measure, pose, scene.sampling.calibration, 900_000 + 1000 * number), sigma)
-        )
-    balls = {view.name: simulate.ball_picture(studio, view, print) for view in scene.ball_view}
-    plate, noise = simulate.plate_truth(studio, folder, print)
-    simulate.surface_truth(studio, folder, views["plate"], print)
-    record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, noise)
-    capture.write_truth(folder / "truth" / "truth.json", record)
+        raw = studio.photograph(measure, pose, scene.sampling.calibration, 900_000 + 1000 * number)
+        boards.append(blur(raw, sigma))
     return Pictures(plate, balls, boards)
 
 
@@ -124,18 +145,18 @@ def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: P
         write_bytes(out / "calibration" / f"calib_{board:02d}.jpg", capture.srgb_jpeg(picture, shoot.sensor, board))
 
 
-def place_of(scene_toml: Path, folder: Path) -> tuple[SimulatedScene, Pictures]:
-    """The reduced scene and its pictures, rendered when they are not there."""
+def place_of(scene_toml: Path, bundled: Path, folder: Path) -> tuple[SimulatedScene, Pictures]:
+    """The reduced scene and its pictures, rendered when they are not there; ``bundled``: the capture with its truth."""
     scene = reduced(load_scene(scene_toml))
     kept = folder / "radiance.npz"
     if not kept.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        pictures = render(scene, folder)
-        pictures.save(kept)
+        render(scene, bundled / "truth", folder).save(kept)
     return scene, Pictures.load(kept)
 
 
 if __name__ == "__main__":
-    place, shots = place_of(Path(sys.argv[1]), Path(sys.argv[2]) / "radiance")
-    for index in range(int(sys.argv[3])):
-        photograph(place, shots, index, Path(sys.argv[2]) / "radiance", Path(sys.argv[2]) / f"capture_{index:03d}")
+    scene_file, capture_folder, where = (Path(word) for word in sys.argv[1:4])
+    place, shots = place_of(scene_file, capture_folder, where / "radiance")
+    for index in range(int(sys.argv[4])):
+        photograph(place, shots, index, where / "radiance", where / f"capture_{index:03d}")

@@ -136,8 +136,8 @@ class Composite(Params):
 class Uncertainty(Params):
     """How far each pixel can be trusted."""
 
-    pixels: int = Field(6000, ge=100, le=1_000_000, description="most pixels that are traced for a wrong light")
-    samples: int = Field(16, ge=4, le=4096, description="samples of each of them")
+    pixels: int = Field(4000, ge=100, le=1_000_000, description="most pixels that are traced for a wrong light")
+    samples: int = Field(8, ge=4, le=4096, description="samples of each of them")
     share: float = Field(0.01, ge=0, lt=1, description="of the variance: errors that stay below together are left out")
 
 

@@ -1,5 +1,7 @@
 """Laws of the error budget: every mode against finite differences, squares that add, scaling, no NaN at the edges."""
 
+import json
+
 import numpy as np
 import pytest
 from test_transport import GREY, all_rays, camera, ground, looking_down, sky, sphere
@@ -10,10 +12,12 @@ from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points, perturb, rotation_exp
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.environment import AXES, SCALE_SIGMA, irradiance, total_energy
+from pipeline.run.formats import read_exr
 from pipeline.transport.scene import build_worlds
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.variant import use_mitsuba
-from pipeline.types import BallFit, Emitter, Raster, View
+from pipeline.types import BallFit, Emitter, Raster, Surface, View
+from stages import knobs, uncertainty
 
 LAMP = np.array([0.4, 0.8, 0.447])
 
@@ -322,3 +326,47 @@ def test_points_that_pixels_see_project_back():
     assert 0 < on_object.sum() < len(on_object)
     assert project(camera(), camera_points(looking_down(), points)[0]) == pytest.approx(px, abs=2e-3)  # float32 rays
     assert points[~on_object][:, 1] == pytest.approx(np.zeros((~on_object).sum()), abs=1e-5)
+
+
+def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
+    """Squares add up as the header says (to the digits of 16 bit); what nothing touches has the plate's own sigma."""
+    unsure = read_exr(desk_build / "uncertainty" / "uncertainty.exr")
+    layers = read_exr(desk_build / "render" / "layers.exr")
+    plate = read_exr(desk_build / "develop" / "photographs" / "plate.exr")
+    modes = unsure.attributes["insitu:modes"].split(",")
+    assert {"scale", "flux_lamp_1", "pose_0"} <= set(modes)
+    sigma = unsure.rgb("sigma").astype(float)
+    parts = sum(unsure.rgb(name).astype(float) ** 2 for name in ("plate", "render", *(f"mode_{m}" for m in modes)))
+    assert np.isfinite(sigma).all()
+    assert np.sqrt(parts) == pytest.approx(sigma, rel=2e-3)
+    alone = (layers["influence"] == 0) & (layers["obj.A"] == 0)
+    assert alone.any()
+    assert sigma[alone] == pytest.approx(np.sqrt(plate.rgb("variance")[alone]), rel=2e-3)
+    covered = layers["obj.A"] > 0.999
+    assert not unsure.rgb("plate")[covered].any()  # nothing of the plate is left there
+    budget = json.loads((desk_build / "uncertainty" / "budget.json").read_text())
+    assert "near field: the map at the objects" in {row["term"] for row in budget["not_covered"]}
+    assert 0.001 < budget["regions"]["object"]["mean_rel"]["total"] < 0.02
+
+
+def test_nothing_inserted_is_the_plate_and_its_sigma():
+    random = np.random.default_rng(3)
+    rgb = 1 + random.random((16, 24, 3)).astype(np.float32)
+    variance = (0.01 * rgb) ** 2
+    variance[3, 4] = np.inf
+    plate = Raster({**Raster.split(rgb), **Raster.split(variance, "variance")}, "acescg")
+    names = [f"{layer}.{c}" for layer in ("obj", "lost", "gained", "without", "variance") for c in "RGB"]
+    layers = Raster({n: np.zeros((16, 24)) for n in [*names, "obj.A", "ground", "noise.change", "noise.obj"]}, "acescg")
+    channels = {**Raster.split(rgb), **Raster.split(np.ones_like(rgb), "mul"), **Raster.split(0 * rgb, "add")}
+    composite = Raster({**channels, **Raster.split(0 * rgb, "obj"), "obj.A": np.zeros((16, 24))}, "acescg")
+    result = uncertainty.compute(
+        wishes={"object": []}, camera=camera(), views={"plate": joint()[0]}, photographs={"plate": plate}, balance={},
+        balls={}, environment=environment(sky()), emitters=[], plane=ground(), albedo=environment(sky()),
+        surface=Surface(), local_proxies=[], occluders=[], layers=layers, composite=composite, records={},
+        params=knobs.Uncertainty.model_validate({}),
+    )  # fmt: skip
+    found = result.outputs["uncertainty"].rgb("sigma").astype(float)
+    assert found == pytest.approx(np.sqrt(variance), rel=1e-3)
+    assert result.numbers["unknown_px"] == 1
+    assert result.numbers["modes"] == {}
+    assert "1 px" in result.warnings[0]
