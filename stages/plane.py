@@ -168,14 +168,15 @@ def against_cloud(
     chi2 = found.chi2(covariance)
     if chi2 > AGREE_CHI2:
         worst = max(spots, key=lambda name: abs(heights[name]))
+        normal = ", ".join(f"{value:.5f}" for value in found.normal)
         warnings.append(
             f"plane: the surface that further views show is {1000 * heights[worst]:+.2f} mm off the markers' plane "
-            f"at {worst} ({shifts[worst]:.2f} px; chi2 {chi2:.0f}, expected below {AGREE_CHI2:.0f}): are markers "
-            "flat, on thin paper? [[object]] lift_m corrects the height"
+            f"at {worst} ({shifts[worst]:.2f} px), its normal ({normal}), the markers' (0, 1, 0) (chi2 {chi2:.0f}, "
+            f"expected below {AGREE_CHI2:.0f}): are markers flat, on thin paper? [[object]] lift_m corrects the height"
         )
     sigma = np.sqrt(np.diag(found.covariance))
     return {
-        "points": found.points, "tilt_deg": float(np.degrees(np.hypot(*found.fit[:2]))),
+        "points": found.points, "normal": found.normal.tolist(), "tilt_deg": float(np.degrees(np.hypot(*found.fit[:2]))),
         "offset_m": float(found.fit[2]), "offset_sigma_m": float(sigma[2]),
         "tilt_sigma_deg": float(np.degrees(np.hypot(*sigma[:2]))),
         "scatter_m": found.scatter_m, "uneven_m": found.uneven_m, "chi2": chi2, "agrees": chi2 <= AGREE_CHI2,

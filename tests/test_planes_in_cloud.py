@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from printed_board import looking_at
-from test_plane import CAMERA, CENTRE, FACTS, computed, view_of
+from test_plane import CAMERA, CENTRE, COVARIANCE, FACTS, POSE, cloud, computed, view_of
 
 from pipeline.camera.planes_in_cloud import flat_surfaces, upright
 from pipeline.transport.beside import over
@@ -142,3 +142,16 @@ def test_points_over_an_outline_lie_in_it() -> None:
     points = over(np.array([[0, 0, 0], [2.0, 0, 0], [2, 1, 0], [0, 1, 0]]))
     assert ((points > 0) & (points < [2, 1, 1e-9])).all(0)[:2].all()
     np.testing.assert_allclose(points.mean(0), [1, 0.5, 0])
+
+
+def test_a_disagreement_names_both_normals() -> None:
+    """Markers on a card that is tilted by 0.6 degrees against the surface: past 3 sigma, with where each points."""
+    wishes = {"object": [{"name": "thing", "position_m": (CENTRE[0], CENTRE[2])}]}
+    views = {"plate": view_of(POSE, covariance=COVARIANCE * 0.01)}
+    result = computed(FACTS, wishes, views, cloud((0.01, 0.0), 0.0, 7))
+    (said,) = [text for text in result.warnings if "off the markers' plane at thing" in text]
+    assert "its normal (0.0000" in said or "its normal (-0.0000" in said
+    assert "the markers' (0, 1, 0)" in said
+    np.testing.assert_allclose(result.numbers["cloud"]["normal"], [0, 1, 0.01], atol=1e-3)
+    fine = computed(FACTS, wishes, views, cloud((0.0, 0.0), 0.0, 7))
+    assert not any("markers' plane" in text for text in fine.warnings)

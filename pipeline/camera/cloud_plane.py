@@ -37,6 +37,12 @@ class CloudPlane:
     scatter_m: float
     uneven_m: float
 
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normal (3,), upward, world frame."""
+        normal = np.array([-self.fit[1], 1.0, self.fit[0]])
+        return np.asarray(normal / np.linalg.norm(normal))
+
     def height(self, spot: np.ndarray) -> float:
         """Height [m] of the surface at a point (3,) of the world."""
         return float(self.fit[2] + self.fit[1] * spot[0] - self.fit[0] * spot[2])

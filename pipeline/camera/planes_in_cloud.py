@@ -156,7 +156,7 @@ def _outlined(cloud: Reconstruction, covariances: np.ndarray, members: np.ndarra
     fit = fit_plane((points - middle) @ frame.T, variance_along(covariances[members], normal))
     if fit is None:
         return None
-    frame = upright(frame.T @ _unit(np.array([-fit.fit[1], 1.0, fit.fit[0]])))
+    frame = upright(frame.T @ fit.normal)
     origin = middle + frame[1] * fit.fit[2]
     across, up = ((points - origin) @ frame[[0, 2]].T).T
     (left, right), (low, high) = (_ends(values) for values in (across, up))
