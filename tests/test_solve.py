@@ -249,6 +249,17 @@ def test_only_what_final_misses_is_refused_and_the_nearest_is_named(asking):
         asking(time_budget=30, max_error=0.02)
 
 
+def test_knobs_that_are_given_are_what_a_refusal_blames(asking):
+    with pytest.raises(ManifestError, match=r"the finest that the given knobs leave \(2 samples, a map of 2048 px\)"):
+        asking("render.samples=2", max_error=0.02)
+
+
+def test_a_picture_without_objects_has_no_error_to_solve_for(asking, monkeypatch):
+    monkeypatch.setitem(RECORD, "differences", {"2-8": {"object": None, "shadow": None}})
+    with pytest.raises(ManifestError, match="too little of an object"):
+        asking(max_error=0.02)
+
+
 def test_what_makes_no_sense_is_refused(capsys, tmp_path):
     for words in (["--max-error", "2"], ["--max-error", "0"], ["--time-budget", "-3"]):
         (line,) = refused(capsys, 2, "run", DESK, "--out", tmp_path, *words)

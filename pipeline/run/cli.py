@@ -282,10 +282,12 @@ def solved(chosen: Settings, args: argparse.Namespace) -> Settings:
     fixed = given(args.capture, args.scene, args.set, KNOBS)
     question = Question(args.max_error, args.time_budget, settle, fixed)
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
+    from pipeline.run.progress import shown
     from pipeline.run.runner import Build
     from stages.order import graph
 
-    return answer(question, Build(graph(), out_of(args), chosen, KNOBS), say)
+    with shown():
+        return answer(question, Build(graph(), out_of(args), chosen, KNOBS), say)
 
 
 def looked_at(chosen: Settings, args: argparse.Namespace) -> Settings:

@@ -106,6 +106,11 @@ def key_of(build: Build) -> str:
 def chosen(question: Question, build: Build, pilot: Pilot) -> tuple[Setting, Model]:
     """The best setting for the question, or that nearest to it; and the model that says so."""
     found = model.fitted(pilot.record)
+    if not found.sampling:
+        raise ManifestError(
+            "--max-error, --time-budget: the pilot shows too little of an object or its shadow to measure an error; "
+            "put a larger one into scene.toml, or take --quality"
+        )
     params = build.settings.params
     fixed = {knob: params[knob.split(".")[0]][knob.split(".")[1]] for knob in question.given if knob in FINEST.changes}
     among = model.candidates(fixed)
@@ -124,10 +129,10 @@ def check(question: Question, found: Model, setting: Setting, pilot: Mapping[str
     error, seconds = found.error(setting), found.left(setting) + pilot["cpu_seconds"]
     if question.max_error is not None and error > question.max_error:
         least = math.ceil(error * 1e4) / 1e4
+        which = "the finest setting, as final's" if setting == FINEST else "the finest that the given knobs leave"
         raise ManifestError(
-            f"--max-error: is {question.max_error:g}; the finest setting, final's {setting.samples} samples and map of "
-            f"{setting.width} px, is predicted to err by {error:.4f}, most of it {largest(found, setting)}; "
-            f"ask {least:g} or more"
+            f"--max-error: is {question.max_error:g}; {which} ({setting.samples} samples, a map of {setting.width} px), is "
+            f"predicted to err by {error:.4f}, most of it {largest(found, setting)}; ask {least:g} or more"
         )
     if question.time_budget is not None and seconds > question.time_budget:
         where = f" for an error of {question.max_error:g}" if question.max_error is not None else ""
@@ -159,6 +164,7 @@ def foretold(found: Model, setting: Setting, pilot: Mapping[str, Any]) -> dict[s
         "figures": found.parts(setting),
         "cpu_seconds": found.seconds(setting),
         "stages": cost,
+        "still_to_run": [name for name in cost if name in found.rest(setting)],
         "with_pilot_cpu_seconds": found.left(setting) + pilot["cpu_seconds"],
         "pilot_cpu_seconds": pilot["cpu_seconds"],
         "wall_seconds_at_the_pilots_pace": found.left(setting) * pilot["wall_over_cpu"],
@@ -181,11 +187,14 @@ def note(build: Build) -> str:
         return ""
     figures = posterior(build, told["predicted"]["figures"], pilot["pilot"])
     truth = against_truth(build)
+    costs = {name: float(record["cpu_seconds"]) for name, record in records.items() if record}
     reached = {
         "error": max(part["all"] for part in figures.values()),
         "figures": figures,
-        "cpu_seconds": math.fsum(record["cpu_seconds"] for record in records.values() if record),
-        "stages": {name: record["cpu_seconds"] for name, record in records.items() if record},
+        "cpu_seconds": math.fsum(costs.values()),
+        "with_pilot_cpu_seconds": told["predicted"]["pilot_cpu_seconds"]
+        + math.fsum(costs[name] for name in told["predicted"]["still_to_run"]),
+        "stages": costs,
         "against_truth": truth and {"error": max(truth.values()), **truth},
     }
     write(build.out / RUN, told | {"reached": reached})

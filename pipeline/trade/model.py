@@ -163,10 +163,15 @@ class Model:
         """CPU seconds of the whole chain."""
         return math.fsum(self.cost(setting).values())
 
-    def left(self, setting: Setting) -> float:
-        """CPU seconds of what is still to be run after the pilot, which leaves its stages at its width."""
+    def rest(self, setting: Setting) -> set[str]:
+        """Stages that are still to be run after the pilot, which leaves its own at its width."""
         done = self.stages if setting.width == self.width else self.stages.keys() - GROWING.keys()
-        return math.fsum(spent for name, spent in self.cost(setting).items() if name not in done)
+        return self.cost(setting).keys() - done
+
+    def left(self, setting: Setting) -> float:
+        """CPU seconds of these."""
+        cost = self.cost(setting)
+        return math.fsum(cost[name] for name in self.rest(setting))
 
 
 def fitted(pilot: Mapping[str, Any]) -> Model:
