@@ -162,7 +162,7 @@ def test_interrupted_writing_is_not_taken_for_the_old_result(folder, monkeypatch
 def test_no_temporary_files_remain(folder, monkeypatch):
     run(folder)
     monkeypatch.setattr("os.replace", lambda *paths: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(ArtifactError, match=r"cannot be written \(disk full\)"):
         run(folder, {"pictures": 2.0})
     monkeypatch.undo()
     run(folder, {"pictures": 2.0})

@@ -27,16 +27,26 @@ REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary sibling that replaces ``path`` when the block ends well and vanishes when it does not."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    """A temporary sibling that replaces ``path`` when the block ends well and vanishes when it does not.
+
+    Raises ArtifactError when it cannot be written: the disk is full, or read only.
+    """
+    scratch = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
         yield scratch / path.name
         if path.is_dir():
             path.rename(scratch / "old")
         os.replace(scratch / path.name, path)
+    except OSError as error:
+        raise ArtifactError(
+            f"{path}: cannot be written ({error.strerror or error}), needed room and permission there; make some and "
+            "run the same command again, what is finished is kept"
+        ) from error
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -69,7 +79,10 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
     if raster.space == ACESCG:
         header["chromaticities"] = AP1_CHROMATICITIES
     with atomic_path(path) as scratch:
-        OpenEXR.File(header, channels).write(str(scratch))
+        try:
+            OpenEXR.File(header, channels).write(str(scratch))
+        except RuntimeError as error:
+            raise OSError(str(error).replace(str(scratch), path.name)) from error
 
 
 def read_exr(path: Path, space: str | None = None) -> Raster:
