@@ -1,25 +1,27 @@
 """Albedo of the plane, and its gloss: the plate's radiance over the light that the probe saw (equations 6 to 8).
 
 The plate is read at every texel of the modelled rectangle through the lens, noise not baked in; texels that the plate
-does not show, or shows clipped, or that a proxy hides, continue their surroundings and are marked in ``seen``. A plane
-alone under distant light needs one step. With proxies their shadows are divided out and their bounced light is taken
-off, by the gathered form or the damped iteration (`pipeline.transport.radiosity`); their own albedo is measured too.
-Shadows of compact lights that nothing modelled casts are looked for and masked (`pipeline.transport.shadows`); gloss is
-taken up when held-out cells ask for it (`pipeline.transport.specular`). ``route = "gradient"`` refines the result by
-differentiable rendering. Limits: proxies are diffuse; a shadow that is
-not found stays in the albedo, and the ratio composite undoes it again.
+does not show, or shows clipped, or that a proxy or an occluder's mask hides, continue their surroundings and are marked
+in ``seen``. A plane alone under distant light needs one step. With proxies their shadows are divided out and their
+bounced light is taken off, by the gathered form or the damped iteration (`pipeline.transport.radiosity`); their own
+albedo is measured too. Shadows of compact lights that nothing modelled casts are looked for and masked
+(`pipeline.transport.shadows`); gloss is taken up when held-out cells ask for it (`pipeline.transport.specular`).
+``route = "gradient"`` refines the result by differentiable rendering. Limits: proxies are diffuse; a shadow that is not
+found stays in the albedo, and the ratio composite undoes it again.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import ACESCG
+from pipeline.conventions import ACESCG, CLIPPED
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
-from pipeline.run.errors import NumericalError
+from pipeline.run.errors import ArtifactError, CaptureError, NumericalError
+from pipeline.run.formats import read_mask
 from pipeline.run.stage import Stage
 from pipeline.transport.gradient import Fit, fit
 from pipeline.transport.patches import enlarged
@@ -47,7 +49,7 @@ def compute(
     params: knobs.Reflectance,
 ) -> Result:
     """Albedo texture, ACEScg. Raises NumericalError when no light arrives or the plate does not show the plane."""
-    plate, view = photographs["plate"], views["plate"]
+    plate, view = unhidden(photographs["plate"], occluders), views["plate"]
     alone = irradiance(environment.rgb(), plane.normal[None])[0]
     if not np.all(alone > 0):
         raise NumericalError(
@@ -137,6 +139,31 @@ def compute(
     ]
     outputs = {"albedo": raster, "surface": surface, "local_proxies": local_proxies}
     return Result(outputs, numbers, warnings, terms)
+
+
+def unhidden(plate: Raster, occluders: list[Occluder]) -> Raster:
+    """The plate with every pixel that a mask puts behind something real marked as unusable: it shows no plane.
+
+    Raises CaptureError when a mask cannot be read or has another size.
+    """
+    hidden = np.zeros(plate.shape, bool)
+    for occluder in occluders:
+        if occluder.mask_file is None:
+            continue
+        try:
+            mask = read_mask(Path(occluder.mask_file))
+        except ArtifactError as error:
+            raise CaptureError(f"occluder {occluder.name}: {error}") from error
+        if mask.shape != plate.shape:
+            raise CaptureError(
+                f"occluder {occluder.name}: {occluder.mask_file} is {mask.shape[1]} x {mask.shape[0]} pixels; expected "
+                f"{plate.shape[1]} x {plate.shape[0]}; draw it on the developed plate"
+            )
+        hidden |= mask > 0
+    if not hidden.any():
+        return plate
+    bits = np.where(hidden, plate["mask"] | np.uint32(CLIPPED), plate["mask"]).astype(np.uint32)
+    return Raster({**plate.channels, "mask": bits}, plate.space, plate.attributes)
 
 
 def texture_evidence(model: str, kept: float) -> dict[str, Any]:
