@@ -47,6 +47,9 @@ from pipeline.simulation.world import Place
 SMOOTHING_PX = 5.0  # of the light that the ball throws
 REGION_GROWTH = 3  # pixels added round the region that gets more samples
 CHANGE_SEED = 80_000
+LAMP_ITSELF = (
+    1e-3  # of a small lamp's radiance: a sample above it met the lamp through mirrors, not as light on a surface
+)
 SHADOW = 0.05  # relative change of what is called a shadow
 
 
@@ -70,9 +73,9 @@ class Studio:
         target = view.target_m or self.scene.plate.target_m
         return look_at(np.array(position), np.array(target))
 
-    def radiance(self, *parts: dict[str, Any], small_lamps: bool = True) -> Measure:
+    def radiance(self, *parts: dict[str, Any]) -> Measure:
         """Path-traced radiance of the place with these parts in it."""
-        return path_radiance(self.mi, self.place.load(*parts, small_lamps=small_lamps), self.scene.sampling.depth)
+        return path_radiance(self.mi, self.place.load(*parts), self.scene.sampling.depth)
 
     def glared(self, picture: np.ndarray) -> np.ndarray:
         """What the lens' glare makes of a picture (H, W, 3)."""
@@ -160,8 +163,8 @@ def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None
 
     Light that the ball throws onto the table is hard to sample: it would speckle the picture. It is smooth, since the
     ball is convex, so it is found as the difference from a black ball under the same random numbers and smoothed, as
-    irradiance on each surface and as radiance in the ball; its energy is kept. What it throws of small lamps is traced
-    from them (`pipeline.simulation.thrown`).
+    irradiance on each surface and as radiance in the ball; its energy is kept. What it throws of small lamps themselves
+    is traced from them (`pipeline.simulation.thrown`), and samples that meet one by way of the ball are left out here.
     """
     progress(f"{view.name}: mirror ball")
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
@@ -169,22 +172,23 @@ def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None
     people = place.photographer(pose)
     seed = 100_000 * (2 + [v.name for v in scene.ball_view].index(view.name))
     small = [lamp for lamp in scene.light.lamp if lamp.diameter_deg < SMALL_DEG]
+    lamps = min((scene.light.scale * max(lamp.radiance) for lamp in small), default=np.inf)
     some = max(16, sampling.ball // 4) if small else sampling.ball  # what is smoothed needs fewer
-    mirror = studio.photograph(studio.radiance(people, place.ball(), small_lamps=not small), pose, some, seed)
+    bright = path_radiance(studio.mi, place.load(people, place.ball()), sampling.depth, LAMP_ITSELF * lamps)
+    mirror = studio.photograph(bright, pose, some, seed)
     dark = place.load(people, place.ball(black=True))
     ball = next(shape for shape in dark.shapes() if shape.id() == "ball")
 
-    def behind(world: Any, black: Any, samples: int) -> np.ndarray:
-        base = mirrored_radiance(studio.mi, world, sampling.depth, black, scene.ball.reflectance)
+    def behind(samples: int, brightest: float) -> np.ndarray:
+        base = mirrored_radiance(studio.mi, dark, sampling.depth, ball, scene.ball.reflectance, brightest)
         return studio.photograph(base, pose, samples, seed)
 
     def seen(measure: Measure) -> np.ndarray:
         return studio.photograph(measure, pose, sampling.pass_samples, seed)
 
-    black = without = behind(dark, ball, sampling.ball)
+    black = without = behind(sampling.ball, np.inf)
     if small:
-        dim = place.load(people, place.ball(black=True), small_lamps=False)
-        without = behind(dim, next(shape for shape in dim.shapes() if shape.id() == "ball"), some)
+        without = behind(some, LAMP_ITSELF * lamps)
     surfaces = [list(place.table_and_prints().values()), *([box] for box in place.boxes().values())]
     albedo = [seen(surface_albedo(studio.mi, dark, shapes)) for shapes in surfaces]
     thrown = spread_light(mirror - without, albedo, seen(first_hit(studio.mi, dark, [ball])))

@@ -133,8 +133,9 @@ def lens_exif(camera: CameraModel) -> bytes:
 
 
 def write_picture(path: Path, rgb: np.ndarray, extra: dict[str, np.ndarray] | None = None, unit: str = UNIT) -> None:
-    """Truth picture (H, W, 3) as half-float EXR in ACEScg."""
-    write_exr(path, Raster({**Raster.split(rgb), **(extra or {})}, ACESCG, {"insitu:unit": unit}), half=True)
+    """Truth picture (H, W, 3) as EXR in ACEScg, of half floats unless something in it is too bright for them."""
+    half = bool(np.max(rgb) < np.finfo(np.float16).max)
+    write_exr(path, Raster({**Raster.split(rgb), **(extra or {})}, ACESCG, {"insitu:unit": unit}), half=half)
 
 
 def write_layers(path: Path, layers: dict[str, np.ndarray], shape: tuple[int, int]) -> None:

@@ -49,21 +49,32 @@ def latlong_rays(mi: Any, centre: np.ndarray, width: int, height: int) -> Shoot:
     return shoot
 
 
-def path_radiance(mi: Any, scene: Any, depth: int) -> Measure:
-    """Path-traced radiance along a ray: three values."""
+def path_radiance(mi: Any, scene: Any, depth: int, brightest: float = np.inf) -> Measure:
+    """Path-traced radiance along a ray: three values. Samples above ``brightest`` count nothing."""
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 5})
 
     def measure(ray: Any, sampler: Any) -> list[Any]:
         value, _, _ = integrator.sample(scene, sampler, ray)
-        return [value.x, value.y, value.z]
+        return dimmed(mi, value, brightest)
 
     return measure
 
 
-def mirrored_radiance(mi: Any, scene: Any, depth: int, ball: Any, reflectance: tuple[float, ...]) -> Measure:
+def dimmed(mi: Any, value: Any, brightest: float) -> list[Any]:
+    """Three values, nothing where one is above ``brightest``: such a sample met a small lamp by way of a mirror."""
+    import drjit as dr
+
+    if np.isfinite(brightest):
+        value = dr.select(dr.max(value) > brightest, mi.Color3f(0), value)
+    return [value.x, value.y, value.z]
+
+
+def mirrored_radiance(
+    mi: Any, scene: Any, depth: int, ball: Any, reflectance: tuple[float, ...], brightest: float = np.inf
+) -> Measure:
     """Radiance of a scene with a black ball, seen directly or once mirrored in that ball: three values.
 
-    What the ball throws onto its surroundings is missing.
+    What the ball throws onto its surroundings is missing. Samples above ``brightest`` count nothing.
     """
     import drjit as dr
 
@@ -76,7 +87,7 @@ def mirrored_radiance(mi: Any, scene: Any, depth: int, ball: Any, reflectance: t
         origin, direction = dr.select(on_ball, mirrored.o, ray.o), dr.select(on_ball, mirrored.d, ray.d)
         value, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(origin, direction))
         value = dr.select(on_ball, value * mi.Color3f(*(float(r) for r in reflectance)), value)
-        return [value.x, value.y, value.z]
+        return dimmed(mi, value, brightest)
 
     return measure
 

@@ -223,7 +223,7 @@ class Twin(Place):
         found: dict[str, Any] = grey(super().photographer(world_from_camera))
         return found
 
-    def room(self, small_lamps: bool = True) -> dict[str, Any]:
+    def room(self) -> dict[str, Any]:
         """The distant light of the current group."""
         assert self.lights is not None
         return {"room": {"type": "envmap", "bitmap": self.mi.Bitmap(self.lights[self.group].astype(np.float32))}}

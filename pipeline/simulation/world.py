@@ -159,12 +159,9 @@ class Place:
                 self._boxes[f"box_{model.name}"] = mesh(self.mi, model.name, parts, bsdf, uv, smooth=False)
         return self._boxes
 
-    def room(self, small_lamps: bool = True) -> dict[str, Any]:
-        """The distant light, with or without its smallest lamps, or a closed room's walls; and what glows nearby."""
+    def room(self) -> dict[str, Any]:
+        """The distant light, or a closed room's walls; and what glows nearby."""
         facts = self.scene.light
-        if not small_lamps:
-            large = [lamp for lamp in facts.lamp if lamp.diameter_deg >= light.SMALL_DEG]
-            facts = facts.model_copy(update={"lamp": large})
         made: dict[str, Any] = {}
         if self.scene.room is None:
             made["room"] = {"type": "envmap", "bitmap": self.mi.Bitmap(light.mitsuba_envmap(facts))}
@@ -251,10 +248,10 @@ class Place:
             made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, self.mi.load_dict(bsdf))
         return made
 
-    def load(self, *parts: dict[str, Any], prints: bool = True, small_lamps: bool = True) -> Any:
+    def load(self, *parts: dict[str, Any], prints: bool = True) -> Any:
         """A Mitsuba scene of the table, the printed sheets on it, the boxes, the room and the given parts."""
         scene: dict[str, Any] = {"type": "scene", **self.table_and_prints(prints), **self.boxes()}
-        scene |= self.room(small_lamps)
+        scene |= self.room()
         for part in parts:
             scene.update(part)
         return self.mi.load_dict(scene)
