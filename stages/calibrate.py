@@ -1,37 +1,36 @@
 """Intrinsics and distortion from board photographs, with covariance; held-out error chooses the model.
 
-Method: ChArUco corners; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
-(Gauss-Newton, poses eliminated). From one focal length without distortion, the terms k1, k2, separate fx and fy, p1 p2
-and k3 are offered in turn, twice; a term stays when photographs that it was not fitted to gain more than 9 in deviance
-per parameter (three standard errors of a Gaussian) and do so consistently. Covariance: inverse normal matrix of the
+Method: corners of the board; a start by Zhang's method (OpenCV); joint least squares over lens and board poses
+(Gauss-Newton, poses eliminated); which terms of distortion stay, and whether the lens is a fisheye, is decided by
+photographs that it was not fitted to (`pipeline/camera/lens_ladder.py`). Covariance: inverse normal matrix of the
 chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Without
 board photographs the lens comes from the tracks of the further views (stage sfm), with the same covariance; from a
-former calibration; or, for want of all these, from the focal length in EXIF and lensfun, with the uncertainty that such
-words have. A set of photographs that leaves rays of the frame uncertain is flagged, and the one to take next is named.
-Limits: one focus and zoom for all photographs of a camera; a flat board; Brown's five terms: whether residuals still
-have a pattern over the frame is tested, a fisheye is refused; terms left out have no variance, so the evidence says
-what they could cost.
+former calibration; or, for want of all these, from the focal length in EXIF and lensfun, with the uncertainty of such
+words. A set of photographs that leaves rays of the frame uncertain is flagged, and the one to take next is named.
+Limits: one focus and zoom for all photographs of a camera; a flat board; a fisheye to 88 degrees from its axis; whether
+residuals still have a pattern over the frame is tested; terms left out have no variance, so the evidence says what they
+could cost.
 """
 
 from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.camera import board_doubts
-from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
+from pipeline.camera.adjustment import Adjustment
 from pipeline.camera.board_pictures import board_picture
+from pipeline.camera.distortion import model_of
 from pipeline.camera.exif_camera import exif_camera
 from pipeline.camera.former_camera import reused
 from pipeline.camera.given_camera import given_camera
-from pipeline.camera.lens import project, unproject
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, first_calibration
-from pipeline.camera.resection import minimise, refine, residuals_and_jacobian, robust_scale
+from pipeline.camera.lens_ladder import FEWEST_PHOTOS, SURE, Photos, best_lens
+from pipeline.camera.opencv_bridge import Sightings, board_sightings
 from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
 from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
@@ -41,29 +40,10 @@ from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result
 from stages import knobs
 
-LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",))
 FEWEST_CORNERS = 8  # of a photograph that is used
-FEWEST_PHOTOS = 3
-SAME_FOCAL = 0.01
-NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
-NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
-GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
-CORNER_SIGMA_PX = 0.1
 REFUSED_FOCAL = 0.05  # standard uncertainty, relative
-SURE, PATTERN_PX = 1e-3, 0.1  # chance by which, and size from which, residuals are said to have a pattern
-
-
-@dataclass(frozen=True)
-class Photos:
-    """Corners of the usable photographs: file names, world points (N_i, 3) and pixels (N_i, 2)."""
-
-    files: list[str]
-    world_m: list[np.ndarray]
-    px: list[np.ndarray]
-
-    def only(self, chosen: list[int]) -> Photos:
-        """A subset by index."""
-        return Photos(*([values[i] for i in chosen] for values in (self.files, self.world_m, self.px)))  # type: ignore[arg-type]
+NAMES = {"brown": "Brown's", "rational": "the rational model's", "fisheye": "the fisheye's"}
+PATTERN_PX = 0.1  # size from which residuals are said to have a pattern
 
 
 def compute(
@@ -163,10 +143,8 @@ def calibrated(
         return Result({"camera": camera}, {"source": "given"}, [], [term])
     warnings: list[str] = []
     photos, size = sight(facts, board_photos, warnings)
-    start, poses = first_calibration(photos.world_m, photos.px, size)
-    photos, poses = drop_bad(start, photos, poses, warnings)
-    chosen, errors, evidence = climb(start, poses, photos)
-    judged = judge(chosen, photos, errors, evidence, warnings, params)
+    chosen, warnings = best_lens(photos, size, warnings)
+    judged = judge(chosen.fit, chosen.photos, chosen.errors, chosen.evidence, warnings, params)
     return replace(judged, outputs={"camera": of_optics(judged.outputs["camera"], frame)})
 
 
@@ -210,153 +188,6 @@ def sight(
     return photos, next(iter(sizes))
 
 
-def drop_bad(
-    start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str]
-) -> tuple[Photos, list[np.ndarray]]:
-    """Leave out single wrong corners, and photographs whose residual is far above the typical one."""
-    fit = fit_model(start, poses, photos, ("k1", "k2"))
-    scale = max(robust_scale(np.concatenate(fit.residuals_px)), 0.02)
-    rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
-    limit = GATE * max(float(np.median(rms)), scale)
-    bad = [i for i in range(len(rms)) if rms[i] > limit]
-    rest = [i for i in range(len(rms)) if i not in bad]
-    if bad and len(rest) >= FEWEST_PHOTOS:
-        lens = fit_model(start, [fit.poses[i] for i in rest], photos.only(rest), ("k1", "k2")).camera
-    for i in bad:
-        why = ""
-        if len(rest) >= FEWEST_PHOTOS:
-            why = zoomed(lens, fit.poses[i], photos.world_m[i], photos.px[i], 2 * float(np.median(rms)))
-        warnings.append(f"{photos.files[i]}: residual {rms[i]:.2f} px, others {np.median(rms):.2f} px{why}; left out")
-    if len(rest) < FEWEST_PHOTOS:
-        raise CaptureError(
-            f"calibration: {len(rest)} of {len(rms)} photographs agree with one lens, needed {FEWEST_PHOTOS}; is the "
-            "board flat, and focus and zoom the same in all?"
-        )
-    kept = [np.hypot(*fit.residuals_px[i].T) <= GATE * scale * 2 for i in rest]
-    photos = photos.only(rest)
-    world_m = [points[keep] for points, keep in zip(photos.world_m, kept, strict=True)]
-    px = [points[keep] for points, keep in zip(photos.px, kept, strict=True)]
-    return Photos(photos.files, world_m, px), [fit.poses[i] for i in rest]
-
-
-def zoomed(camera: Camera, pose: np.ndarray, world_m: np.ndarray, px: np.ndarray, limit_px: float) -> str:
-    """What to say of a photograph (points (N, 3), pixels (N, 2)) that another focal length explains to ``limit_px``."""
-    best = (np.inf, 1.0)
-    for step in (0.04, 0.01):  # a coarse search of a factor between 0.6 and 1.65, then a fine one around it
-        for factor in best[1] * np.exp(step * np.arange(-12, 13)):
-            lens = camera.model_copy(update={"fx": camera.fx * factor, "fy": camera.fy * factor})
-            off = residuals_and_jacobian(lens, minimise(lens, pose, world_m, px), world_m, px)[0]
-            best = min(best, (float(np.sqrt((off**2).mean())), float(factor)))
-    if not (best[0] < limit_px and abs(best[1] - 1) > SAME_FOCAL):
-        return ""
-    return f"; it fits a focal length {best[1] - 1:+.0%} off: the zoom was moved"
-
-
-def fit_model(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> Adjustment:
-    """Adjust with these terms free and the others zero; without "fy" one focal length serves both axes."""
-    one_focal = "fy" not in terms
-    free = free_columns(tuple(term for term in terms if term != "fy"), one_focal)
-    values = lens_vector(start) * (free.sum(1) > 0)
-    if one_focal:
-        values[:2] = values[:2].mean()
-    return adjust(with_lens(start, values), poses, photos.world_m, photos.px, free)
-
-
-def held_out(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> np.ndarray:
-    """Mean squared residual (photos,) px^2 of each photograph under a lens fitted to the others (five folds)."""
-    count = len(photos.files)
-    folds = min(5, count)
-    errors = np.full(count, np.inf)
-    for fold in range(folds):
-        train = [i for i in range(count) if i % folds != fold]
-        try:
-            lens = fit_model(start, [poses[i] for i in train], photos.only(train), terms).camera
-            for i in range(fold, count, folds):
-                every = np.ones(len(photos.px[i]), bool)
-                seen = refine(lens, poses[i], photos.world_m[i], photos.px[i], CORNER_SIGMA_PX, every)
-                errors[i] = (seen.residuals_px**2).sum(-1).mean()
-        except NumericalError:
-            continue  # too rich for this fold: its error stays infinite and the term is not taken
-    return np.where(np.isfinite(errors), errors, np.inf)
-
-
-def climb(
-    start: Camera, poses: list[np.ndarray], photos: Photos
-) -> tuple[Adjustment, dict[str, float], list[dict[str, Any]]]:
-    """Add terms while photographs that they were not fitted to gain by them; with the reason for each."""
-    terms: tuple[str, ...] = ()
-    best = held_out(start, poses, photos, terms)
-    corners = np.array([len(px) for px in photos.px])
-    errors = {"none": float(np.sqrt(best.mean()))}
-    evidence: dict[tuple[str, ...], dict[str, Any]] = {}
-    for _ in range(2):  # a term may pay only once a later one is in
-        before = terms
-        for step in LADDER:
-            if set(step) <= set(terms):
-                continue
-            error = held_out(start, poses, photos, terms + step)
-            gain, consistency = improvement(best, error, corners)
-            taken = gain > NEEDED_DEVIANCE * len(step) and consistency > NEEDED_CONSISTENCY
-            errors[" ".join(terms + step)] = float(np.sqrt(error.mean()))
-            because = (
-                f"held-out error {np.sqrt(best.mean()):.4f} -> {np.sqrt(error.mean()):.4f} px: gain in deviance "
-                f"{gain:.1f} (needs {NEEDED_DEVIANCE * len(step):g}), photographs agree at {consistency:+.1f} sigma"
-            )
-            evidence[step] = {"term": f"lens {' '.join(step)}", "modelled": taken, "because": because, "could_cost": ""}
-            if taken:
-                best, terms = error, terms + step
-        if terms == before:
-            break
-    chosen = fit_model(start, poses, photos, terms)
-    for step, entry in evidence.items():
-        if not entry["modelled"]:
-            entry["could_cost"] = cost_of(step, terms, chosen, start, poses, photos)
-    return chosen, errors, list(evidence.values())
-
-
-def cost_of(
-    step: tuple[str, ...],
-    terms: tuple[str, ...],
-    chosen: Adjustment,
-    start: Camera,
-    poses: list[np.ndarray],
-    photos: Photos,
-) -> str:
-    """How far the lens with the term left out would be from the chosen one."""
-    try:
-        shift = disagreement(chosen.camera, fit_model(start, poses, photos, terms + step).camera)
-    except NumericalError:
-        return "unknown: these photographs do not determine it"
-    return f"{shift:.3f} px rms over the frame"
-
-
-def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:
-    """Gain in deviance of the held-out corners, and the photographs' mean gain in its standard errors.
-
-    The latter on logarithms, as distortion costs a board in the corner of the frame a hundred times what it costs one
-    in the middle: the plain mean would carry the scatter of the photographs, not of the models.
-    """
-    if not np.isfinite(after).all():
-        return -np.inf, -np.inf
-    variance = max(float((corners * after).sum() / (2 * corners.sum())), 1e-12)  # of one coordinate
-    gain = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
-    scatter = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
-    return float((corners * (before - after)).sum() / variance), float(gain.mean() / scatter)
-
-
-def disagreement(first: Camera, second: Camera) -> float:
-    """Rms distance, px, between where two lenses image the same rays, over the frame."""
-    y, x = np.meshgrid(np.linspace(0, first.height, 13), np.linspace(0, first.width, 17), indexing="ij")
-    px = np.stack([x, y], -1).reshape(-1, 2)
-    try:
-        xy = unproject(first, px)
-    except NumericalError:
-        return np.inf
-    moved = project(second, np.concatenate([xy, np.ones((len(xy), 1))], -1)) - px
-    finite = np.isfinite(moved).all(-1)
-    return float(np.sqrt((moved[finite] ** 2).sum(-1).mean())) if finite.any() else np.inf
-
-
 def judge(
     chosen: Adjustment,
     photos: Photos,
@@ -367,20 +198,21 @@ def judge(
 ) -> Result:
     """Refuse what does not determine a lens, warn about what hardly does and say what to photograph, and report."""
     camera = chosen.camera
+    model = model_of(camera.distortion)
     shape = pattern(photos.px, chosen.residuals_px, camera.width, camera.height)
     if chosen.rms_px > params.max_rms_px:
-        fisheye = "" if shape.chance > SURE else "; residuals have a pattern over the frame: is it a fisheye?"
+        curved = "" if shape.chance > SURE else "; residuals have a pattern over the frame: no known lens bends so"
         raise NumericalError(
             f"calibrate: residual {chosen.rms_px:.2f} px, needed {params.max_rms_px} px; is the board flat, are "
-            f"square_m and squares right, and focus and zoom the same in all photographs?{fisheye}"
+            f"square_m and squares right, and focus and zoom the same in all photographs?{curved}"
         )
     views = ViewSet(camera, chosen.poses, photos.world_m, photos.px, chosen.sigma_px)
     try:
         certain = lens_sigma(camera, summed(views), chosen.sigma_px)
     except NumericalError as error:
         raise NumericalError(
-            "calibrate: the distortion ends within the frame, needed a lens that fills it: a fisheye is not modelled; "
-            "if it is none, photograph the board in the corners of the frame"
+            "calibrate: the distortion ends within the frame, needed a lens that fills it (a fisheye to 88 degrees "
+            "from its axis); photograph the board in the corners of the frame, or crop a circular fisheye's photographs"
         ) from error
     sigma = np.sqrt(np.diag(camera.covariance))
     relative = float(sigma[0] / camera.fx)
@@ -390,7 +222,7 @@ def judge(
     span = (np.ptp(everything, axis=0) / (camera.width, camera.height)).tolist()
     doubts = doubts_of(camera, len(photos.files), float(tilts.max()), relative, everything, span, certain[1])
     numbers = {
-        "source": camera.source, "rms_px": chosen.rms_px, "corner_sigma_px": chosen.sigma_px,
+        "source": camera.source, "distortion_model": model, "rms_px": chosen.rms_px, "corner_sigma_px": chosen.sigma_px,
         "photos": len(photos.files), "corners": len(everything), "held_out_rms_px": errors,
         "focal_sigma_rel": relative, "principal_point_sigma_px": sigma[2:4].tolist(),
         "tilt_max_deg": float(tilts.max()), "frame_span": span,
@@ -410,10 +242,10 @@ def judge(
     if shape.chance < SURE and shape.rms_px > PATTERN_PX:
         warnings.append(
             f"calibrate: residuals have a pattern over the frame, {shape.rms_px:.2f} px rms, {shape.largest_px:.2f} px "
-            "at most; the lens bends as Brown's terms cannot, or the board is not flat"
+            f"at most; the lens bends as {NAMES[model]} terms cannot, or the board is not flat"
         )
     beyond = {
-        "term": "lens beyond Brown's terms (rational, fisheye)", "modelled": False,
+        "term": f"lens beyond {NAMES[model]} terms" + (" (fisheye)" if model == "brown" else ""), "modelled": False,
         "because": f"residuals averaged over {shape.cells} cells of the frame: so large without a pattern in "
         f"{shape.chance:.2g} of sets",
         "could_cost": f"{shape.rms_px:.3f} px rms over the frame, {shape.largest_px:.3f} px at most",

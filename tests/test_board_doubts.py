@@ -15,6 +15,7 @@ from test_calibrate import POINTS, TRUTH, corners_of, poses_of
 from pipeline.camera import board_doubts, view_checks
 from pipeline.camera.bundle import adjust
 from pipeline.camera.lens import project
+from pipeline.camera.lens_ladder import Photos, drop_bad
 from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import board_sightings, first_calibration, repeated
 from pipeline.camera.rigid import camera_points
@@ -158,10 +159,10 @@ class TestCalibration:
         corners = corners_of(poses, TRUTH, 0.03, 6)
         moved = TRUTH.model_copy(update={"fx": factor * TRUTH.fx, "fy": factor * TRUTH.fy})
         corners[4] = corners_of(poses[4:5], moved, 0.03, 7)[0]
-        photos = calibrate.Photos([f"{n}.jpg" for n in range(9)], [POINTS] * 9, corners)
+        photos = Photos([f"{n}.jpg" for n in range(9)], [POINTS] * 9, corners)
         start, found = first_calibration([POINTS] * 9, corners, (1024, 768))
         warnings: list[str] = []
-        rest, _ = calibrate.drop_bad(start, photos, found, warnings)
+        rest, _ = drop_bad(start, photos, found, warnings)
         assert rest.files == [f"{n}.jpg" for n in range(9) if n != 4]
         (line,) = warnings
         assert line.startswith("4.jpg: residual")

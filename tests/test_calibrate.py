@@ -13,6 +13,7 @@ from printed_board import BOARD, charuco_print, looking_at, photograph
 from pipeline.camera import opencv_bridge
 from pipeline.camera.adjustment import adjust, free_columns, lens_vector
 from pipeline.camera.lens import project
+from pipeline.camera.lens_ladder import disagreement
 from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.rigid import camera_points
@@ -72,7 +73,7 @@ def test_lens_and_model_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
     error = lens_vector(camera) - lens_vector(TRUTH)
     sigma = np.sqrt(np.diag(camera.covariance))
     assert (np.abs(error) <= 4 * sigma).all()  # terms left out: both zero
-    assert calibrate.disagreement(TRUTH, camera) < 0.5
+    assert disagreement(TRUTH, camera) < 0.5
     assert not result.warnings
     assert 0.025 < result.numbers["corner_sigma_px"] < 0.035
 
@@ -89,7 +90,7 @@ def test_full_lens_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     result = run(monkeypatch, corners_of(poses_of(14, (5, 50), 3), full, 0.03, 3))
     taken = {entry["term"] for entry in result.evidence if entry["modelled"]}
     assert {"lens k1", "lens fy", "lens p1 p2"} <= taken
-    assert calibrate.disagreement(full, result.outputs["camera"]) < 1.0
+    assert disagreement(full, result.outputs["camera"]) < 1.0
 
 
 def test_covariance_holds_the_truth() -> None:
@@ -131,7 +132,7 @@ def test_bad_photograph_is_named_and_left_out(monkeypatch: pytest.MonkeyPatch) -
     assert "4.jpg: residual" in text
     assert "7.jpg: 3 corners" in text
     assert result.numbers["photos"] == 7
-    assert calibrate.disagreement(TRUTH, result.outputs["camera"]) < 0.7
+    assert disagreement(TRUTH, result.outputs["camera"]) < 0.7
 
 
 def test_fronto_parallel_boards_are_refused_or_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +194,7 @@ def test_captures_with_known_lens(folder: Path, truth: Camera) -> None:
     assert result.numbers["rms_px"] < 0.2  # the brief's figure
     assert abs(camera.fx / truth.fx - 1) < 1e-3  # measured 1e-4 and 4e-4
     assert np.hypot(camera.cx - truth.cx, camera.cy - truth.cy) < 1.0  # measured 0.17 and 0.57 px
-    assert calibrate.disagreement(truth, camera) < 1.0  # measured 0.2 and 0.6 px rms over the frame
+    assert disagreement(truth, camera) < 1.0  # measured 0.2 and 0.6 px rms over the frame
 
 
 def test_boards_in_one_corner_and_few_are_flagged_with_what_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,7 +217,7 @@ def test_a_shifted_lens(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = result.outputs["camera"]
     error = (lens_vector(camera) - lens_vector(shifted))[[0, 2, 3, 4]]
     assert (np.abs(error) <= 4 * np.sqrt(np.diag(camera.covariance))[[0, 2, 3, 4]]).all()
-    assert calibrate.disagreement(shifted, camera) < 1.0
+    assert disagreement(shifted, camera) < 1.0
 
 
 def fisheye_corners(poses: list[np.ndarray], focal: float, sigma: float) -> list[np.ndarray]:
@@ -245,14 +246,29 @@ def wide_poses() -> list[np.ndarray]:
     return poses
 
 
-@pytest.mark.parametrize("focal", [390.0, 600.0])
-def test_a_fisheye_is_refused(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
-    """150 and 98 degrees across, equidistant: Brown's terms fold within the frame, which is said with that word."""
+def test_a_fisheye_that_looks_behind_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """188 degrees across the diagonal: the corners of the frame have no ray before the camera."""
+    corners = [px for px in fisheye_corners(wide_poses(), 390.0, 0.03) if (px > 0).all() and (px < (1024, 768)).all()]
+    with pytest.raises(NumericalError, match=r"ends within the frame, .* fisheye"):
+        run(monkeypatch, corners)
+
+
+@pytest.mark.parametrize("focal", [450.0, 600.0])
+def test_a_fisheye_is_told_and_fitted(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
+    """130 and 98 degrees across the width, equidistant: no term of a fisheye is needed but its own projection."""
     corners = [
         px for px in fisheye_corners(wide_poses(), focal, 0.03) if (px > 0).all() and (px < (1024, 768)).all()
     ]  # fmt: skip
-    with pytest.raises(NumericalError, match="fisheye"):
-        run(monkeypatch, corners)
+    result = run(monkeypatch, corners)
+    camera = result.outputs["camera"]
+    assert result.numbers["distortion_model"] == "fisheye"
+    assert result.numbers["rms_px"] < 0.05  # 0.03 px each way
+    row = next(row for row in result.evidence if row["term"] == "lens fisheye or rational")
+    assert row["modelled"]
+    truth = camera.model_copy(update={"fx": focal, "fy": focal, "cx": 512.0, "cy": 384.0, "distortion": np.zeros(4)})
+    error = lens_vector(camera) - lens_vector(truth)
+    assert (np.abs(error[:4]) <= 4 * np.sqrt(np.diag(camera.covariance))[:4] + 1e-9).all()
+    assert disagreement(camera, truth) < 1.0
 
 
 def test_a_mild_fisheye_is_within_browns_terms(monkeypatch: pytest.MonkeyPatch) -> None:

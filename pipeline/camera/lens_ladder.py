@@ -1,0 +1,332 @@
+"""Which lens board photographs ask for: terms that photographs gain by which they were not fitted to.
+
+From one focal length without distortion Brown's terms k1, k2, separate fx and fy, p1 p2 and k3, and the rational k4 k5
+k6, are offered in turn, twice; a term stays when held-out photographs gain more than 9 in deviance per parameter (three
+standard errors of a Gaussian) and do so consistently. A fisheye has a ladder of its own, climbed on evidence only, and
+is judged on the same held-out photographs; the model with fewer terms wins a tie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
+from pipeline.camera.distortion import model_of
+from pipeline.camera.lens import project, unproject
+from pipeline.camera.opencv_bridge import first_calibration
+from pipeline.camera.resection import minimise, planar_candidates, refine, residuals_and_jacobian, robust_scale
+from pipeline.camera.residual_pattern import pattern
+from pipeline.run.errors import CaptureError, NumericalError
+from pipeline.types import Camera
+
+LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",), ("k4", "k5", "k6"))
+WIDE_LADDER: tuple[tuple[str, ...], ...] = (("k1", "k2", "k3", "k4", "k5", "k6"), ("fy",), ("p1", "p2"))
+EQUIDISTANT = np.array([4 / 15, 0, 0, 0, 0, 9 / 15, 0, 0])  # atan(r) / r as a ratio of polynomials (Pade)
+ROUGH_PX = 0.3  # of a corner: beyond it another lens is tried
+FISHEYE_LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("k3", "k4"))
+RATIONAL = LADDER[-1]  # the denominator: nothing to divide where nothing bends
+FEWEST_PHOTOS = 3
+SAME_FOCAL = 0.01
+NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
+NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
+GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
+CORNER_SIGMA_PX = 0.1
+SURE = 1e-3  # chance by which residuals are said to have a pattern
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Corners of the usable photographs: file names, world points (N_i, 3) and pixels (N_i, 2)."""
+
+    files: list[str]
+    world_m: list[np.ndarray]
+    px: list[np.ndarray]
+
+    def only(self, chosen: list[int]) -> Photos:
+        """A subset by index."""
+        return Photos(*([values[i] for i in chosen] for values in (self.files, self.world_m, self.px)))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Climbed:
+    """The lens that a ladder ended with, and its photographs.
+
+    ``held``: mean squared residual (photos,) px^2 of each photograph under a lens fitted to others; ``errors``: the
+    table of what was tried, rms px; ``evidence``: a row for each step.
+    """
+
+    fit: Adjustment
+    photos: Photos
+    terms: tuple[str, ...]
+    held: np.ndarray
+    errors: dict[str, float]
+    evidence: list[dict[str, Any]]
+
+
+def best_lens(photos: Photos, size: tuple[int, int], warnings: list[str]) -> tuple[Climbed, list[str]]:
+    """The lens that the photographs ask for, and the warnings with those of the photographs that were left out.
+
+    Wide lenses, a fisheye and the rational one from a wide start, are offered on evidence only: a residual or a pattern
+    that no board has, photographs that agree with no other lens, a model that ends within the frame, or a denominator
+    that was needed. All are then judged on the photographs that the fisheye's fit keeps.
+    """
+    said: list[str] = []
+    narrow: Climbed | None = None
+    try:
+        start, poses = first_calibration(photos.world_m, photos.px, size)
+        kept, poses = drop_bad(start, photos, poses, said)
+        narrow = climb(start, poses, kept, LADDER)
+        why = asks_for_wide(narrow, len(photos.files))
+    except (NumericalError, CaptureError) as error:
+        why, failed = "no other lens agrees with the photographs", error
+    if narrow is not None and not why:
+        return narrow, warnings + said
+    try:
+        wide, also = wide_lenses(photos, size)
+    except (NumericalError, CaptureError):
+        if narrow is None:
+            raise failed from None
+        return replace(narrow, evidence=[*narrow.evidence, wide_row(narrow, f"{why}; none fits")]), warnings + said
+    best, table = contest([narrow, *wide] if narrow is not None else wide)
+    errors = {key: value for one in (narrow, *wide) if one is not None for key, value in one.errors.items()}
+    row = wide_row(best, f"{why}; held-out error " + ", ".join(table))
+    return replace(best, errors=errors, evidence=[*best.evidence, row]), warnings + (said if best is narrow else also)
+
+
+def contest(entrants: list[Climbed]) -> tuple[Climbed, list[str]]:
+    """The best of several on the last one's photographs, fewer terms first, and the table of their errors in words."""
+    photos, poses = entrants[-1].photos, entrants[-1].fit.poses
+    corners = np.array([len(px) for px in photos.px])
+    held = [held_out(one.fit.camera, poses, photos, one.terms) for one in entrants]
+    order = sorted(range(len(entrants)), key=lambda n: len(entrants[n].terms))
+    best = order[0]
+    for n in order[1:]:
+        gain, consistency = improvement(held[best], held[n], corners)
+        more = max(len(entrants[n].terms) - len(entrants[best].terms), 1)
+        if gain > NEEDED_DEVIANCE * more and consistency > NEEDED_CONSISTENCY:
+            best = n
+    table = [
+        f"{np.sqrt(error.mean()):.4f} px as {model_of(one.fit.camera.distortion)} ({' '.join(one.terms) or 'no terms'})"
+        for one, error in zip(entrants, held, strict=True)
+    ]
+    return entrants[best], table
+
+
+def wide_row(best: Climbed, because: str) -> dict[str, Any]:
+    """Evidence for or against a wide lens."""
+    taken = model_of(best.fit.camera.distortion) != "brown"
+    cost = "" if taken else "nothing that held-out photographs show"
+    return {"term": "lens fisheye or rational", "modelled": taken, "because": because, "could_cost": cost}
+
+
+def asks_for_wide(found: Climbed, offered: int) -> str:
+    """Why a wide lens may explain the photographs better; empty when nothing speaks for one."""
+    camera = found.fit.camera
+    shape = pattern(found.photos.px, found.fit.residuals_px, camera.width, camera.height)
+    if found.fit.sigma_px > ROUGH_PX:
+        return f"corners are off by {found.fit.sigma_px:.2f} px"
+    if shape.chance < SURE:
+        return f"residuals have a pattern over the frame ({shape.rms_px:.3f} px rms)"
+    if len(found.photos.files) < offered:
+        return f"{offered - len(found.photos.files)} photographs do not agree with the lens of the others"
+    if np.isinf(disagreement(camera, camera)):
+        return "the distortion ends within the frame"
+    return "the rational model was taken" if set(RATIONAL) <= set(found.terms) else ""
+
+
+def wide_lenses(photos: Photos, size: tuple[int, int]) -> tuple[list[Climbed], list[str]]:
+    """The rational lens and the fisheye that the photographs ask for, and warnings of those that were left out.
+
+    The fisheye's start: the equidistant lens of ten focal lengths that explains the boards best.
+    """
+    diagonal = float(np.hypot(*size))
+    best: tuple[float, Camera, list[np.ndarray]] | None = None
+    for focal in diagonal * np.geomspace(0.33, 1.6, 10):  # 174 to 36 degrees across the diagonal
+        camera = Camera(
+            width=size[0], height=size[1], fx=focal, fy=focal, cx=size[0] / 2, cy=size[1] / 2,
+            distortion=np.zeros(4), covariance=np.zeros((8, 8)), source="calibrated",
+        )  # fmt: skip
+        try:
+            seen = zip(photos.world_m, photos.px, strict=True)
+            poses = [planar_candidates(camera, world_m, px)[0] for world_m, px in seen]
+        except NumericalError:
+            continue  # so short that a corner lies behind the lens
+        each = zip(poses, photos.world_m, photos.px, strict=True)
+        off = [float((residuals_and_jacobian(camera, *one)[0] ** 2).sum(-1).mean()) for one in each]
+        cost = float(np.nanmedian(off)) if np.isfinite(off).any() else np.inf
+        if best is None or cost < best[0]:
+            best = (cost, camera, poses)
+    if best is None:
+        raise NumericalError("calibrate: no fisheye images all corners, needed one that does; check [board]")
+    warnings: list[str] = []
+    kept, poses = drop_bad(best[1], photos, best[2], warnings)
+    curved = climb(best[1], poses, kept, FISHEYE_LADDER)
+    start = curved.fit.camera.model_copy(update={"distortion": EQUIDISTANT})
+    try:
+        return [climb(start, curved.fit.poses, kept, WIDE_LADDER), curved], warnings
+    except NumericalError:
+        return [curved], warnings
+
+
+def drop_bad(
+    start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str]
+) -> tuple[Photos, list[np.ndarray]]:
+    """Leave out single wrong corners, and photographs whose residual is far above the typical one."""
+    fit = fit_model(start, poses, photos, ("k1", "k2"))
+    scale = max(robust_scale(np.concatenate(fit.residuals_px)), 0.02)
+    rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
+    limit = GATE * max(float(np.median(rms)), scale)
+    bad = [i for i in range(len(rms)) if rms[i] > limit]
+    rest = [i for i in range(len(rms)) if i not in bad]
+    if bad and len(rest) >= FEWEST_PHOTOS:
+        lens = fit_model(start, [fit.poses[i] for i in rest], photos.only(rest), ("k1", "k2")).camera
+    for i in bad:
+        why = ""
+        if len(rest) >= FEWEST_PHOTOS:
+            why = zoomed(lens, fit.poses[i], photos.world_m[i], photos.px[i], 2 * float(np.median(rms)))
+        warnings.append(f"{photos.files[i]}: residual {rms[i]:.2f} px, others {np.median(rms):.2f} px{why}; left out")
+    if len(rest) < FEWEST_PHOTOS:
+        raise CaptureError(
+            f"calibration: {len(rest)} of {len(rms)} photographs agree with one lens, needed {FEWEST_PHOTOS}; is the "
+            "board flat, and focus and zoom the same in all?"
+        )
+    kept = [np.hypot(*fit.residuals_px[i].T) <= GATE * scale * 2 for i in rest]
+    photos = photos.only(rest)
+    world_m = [points[keep] for points, keep in zip(photos.world_m, kept, strict=True)]
+    px = [points[keep] for points, keep in zip(photos.px, kept, strict=True)]
+    return Photos(photos.files, world_m, px), [fit.poses[i] for i in rest]
+
+
+def zoomed(camera: Camera, pose: np.ndarray, world_m: np.ndarray, px: np.ndarray, limit_px: float) -> str:
+    """What to say of a photograph (points (N, 3), pixels (N, 2)) that another focal length explains to ``limit_px``."""
+    best = (np.inf, 1.0)
+    for step in (0.04, 0.01):  # a coarse search of a factor between 0.6 and 1.65, then a fine one around it
+        for factor in best[1] * np.exp(step * np.arange(-12, 13)):
+            lens = camera.model_copy(update={"fx": camera.fx * factor, "fy": camera.fy * factor})
+            off = residuals_and_jacobian(lens, minimise(lens, pose, world_m, px), world_m, px)[0]
+            best = min(best, (float(np.sqrt((off**2).mean())), float(factor)))
+    if not (best[0] < limit_px and abs(best[1] - 1) > SAME_FOCAL):
+        return ""
+    return f"; it fits a focal length {best[1] - 1:+.0%} off: the zoom was moved"
+
+
+def fit_model(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> Adjustment:
+    """Adjust with these terms free and the others zero; without "fy" one focal length serves both axes.
+
+    The start's family stays; Brown's is the rational one where a term of the denominator is free.
+    """
+    one_focal = "fy" not in terms
+    count = len(start.distortion)
+    if count != 4:
+        count = 8 if set(RATIONAL) & set(terms) else 5
+        padded = np.pad(start.distortion, (0, 3))[:count]
+        start = start.model_copy(update={"distortion": padded})
+    free = free_columns(tuple(term for term in terms if term != "fy"), one_focal, count)
+    values = lens_vector(start) * (free.sum(1) > 0)
+    if one_focal:
+        values[:2] = values[:2].mean()
+    return adjust(with_lens(start, values), poses, photos.world_m, photos.px, free)
+
+
+def held_out(start: Camera, poses: list[np.ndarray], photos: Photos, terms: tuple[str, ...]) -> np.ndarray:
+    """Mean squared residual (photos,) px^2 of each photograph under a lens fitted to the others (five folds)."""
+    count = len(photos.files)
+    folds = min(5, count)
+    errors = np.full(count, np.inf)
+    for fold in range(folds):
+        train = [i for i in range(count) if i % folds != fold]
+        try:
+            lens = fit_model(start, [poses[i] for i in train], photos.only(train), terms).camera
+            for i in range(fold, count, folds):
+                every = np.ones(len(photos.px[i]), bool)
+                seen = refine(lens, poses[i], photos.world_m[i], photos.px[i], CORNER_SIGMA_PX, every)
+                errors[i] = (seen.residuals_px**2).sum(-1).mean()
+        except NumericalError:
+            continue  # too rich for this fold: its error stays infinite and the term is not taken
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def climb(start: Camera, poses: list[np.ndarray], photos: Photos, ladder: tuple[tuple[str, ...], ...]) -> Climbed:
+    """Add terms while photographs that they were not fitted to gain by them; with the reason for each."""
+    terms: tuple[str, ...] = ()
+    best = held_out(start, poses, photos, terms)
+    corners = np.array([len(px) for px in photos.px])
+    family = {FISHEYE_LADDER: "fisheye ", WIDE_LADDER: "wide "}.get(ladder, "")
+    errors = {f"{family}none": float(np.sqrt(best.mean()))}
+    evidence: dict[tuple[str, ...], dict[str, Any]] = {}
+    for _ in range(2):  # a term may pay only once a later one is in
+        before = terms
+        for step in ladder:
+            if set(step) <= set(terms) or (step == RATIONAL and "k1" not in terms):
+                continue
+            error = held_out(start, poses, photos, terms + step)
+            gain, consistency = improvement(best, error, corners)
+            taken = gain > NEEDED_DEVIANCE * len(step) and consistency > NEEDED_CONSISTENCY
+            errors[family + " ".join(terms + step)] = float(np.sqrt(error.mean()))
+            because = (
+                f"held-out error {np.sqrt(best.mean()):.4f} -> {np.sqrt(error.mean()):.4f} px: gain in deviance "
+                f"{gain:.1f} (needs {NEEDED_DEVIANCE * len(step):g}), photographs agree at {consistency:+.1f} sigma"
+            )
+            evidence[step] = {
+                "term": f"lens {family}{' '.join(step)}",
+                "modelled": taken,
+                "because": because,
+                "could_cost": "",
+            }
+            if taken:
+                best, terms = error, terms + step
+        if terms == before:
+            break
+    chosen = fit_model(start, poses, photos, terms)
+    for step, entry in evidence.items():
+        if not entry["modelled"]:
+            entry["could_cost"] = cost_of(step, terms, chosen, start, poses, photos)
+    return Climbed(chosen, photos, terms, best, errors, list(evidence.values()))
+
+
+def cost_of(
+    step: tuple[str, ...],
+    terms: tuple[str, ...],
+    chosen: Adjustment,
+    start: Camera,
+    poses: list[np.ndarray],
+    photos: Photos,
+) -> str:
+    """How far the lens with the term left out would be from the chosen one."""
+    try:
+        shift = disagreement(chosen.camera, fit_model(start, poses, photos, terms + step).camera)
+    except NumericalError:
+        return "unknown: these photographs do not determine it"
+    return f"{shift:.3f} px rms over the frame"
+
+
+def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:
+    """Gain in deviance of the held-out corners, and the photographs' mean gain in its standard errors.
+
+    The latter on logarithms, as distortion costs a board in the corner of the frame a hundred times what it costs one
+    in the middle: the plain mean would carry the scatter of the photographs, not of the models.
+    """
+    if not np.isfinite(after).all():
+        return -np.inf, -np.inf
+    if not np.isfinite(before).all():
+        return np.inf, np.inf
+    variance = max(float((corners * after).sum() / (2 * corners.sum())), 1e-12)  # of one coordinate
+    gain = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
+    scatter = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
+    return float((corners * (before - after)).sum() / variance), float(gain.mean() / scatter)
+
+
+def disagreement(first: Camera, second: Camera) -> float:
+    """Rms distance, px, between where two lenses image the same rays, over the frame."""
+    y, x = np.meshgrid(np.linspace(0, first.height, 13), np.linspace(0, first.width, 17), indexing="ij")
+    px = np.stack([x, y], -1).reshape(-1, 2)
+    try:
+        xy = unproject(first, px)
+    except NumericalError:
+        return np.inf
+    moved = project(second, np.concatenate([xy, np.ones((len(xy), 1))], -1)) - px
+    finite = np.isfinite(moved).all(-1)
+    return float(np.sqrt((moved[finite] ** 2).sum(-1).mean())) if finite.any() else np.inf
