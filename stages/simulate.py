@@ -47,9 +47,7 @@ from pipeline.simulation.world import Place
 SMOOTHING_PX = 5.0  # of the light that the ball throws
 REGION_GROWTH = 3  # pixels added round the region that gets more samples
 CHANGE_SEED = 80_000
-LAMP_ITSELF = (
-    1e-3  # of a small lamp's radiance: a sample above it met the lamp through mirrors, not as light on a surface
-)
+LAMP_ITSELF = 1e-3  # of a small lamp's radiance: a sample above it met the lamp by way of a mirror
 SHADOW = 0.05  # relative change of what is called a shadow
 
 
