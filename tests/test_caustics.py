@@ -18,9 +18,10 @@ from pipeline.light.environment import irradiance
 from pipeline.transport.caustics import Film, thrown, throws
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
+from pipeline.transport.passes import Halves
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
-from pipeline.transport.trace import reference_block, trace
+from pipeline.transport.trace import Samples, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Emitter, Occluder, Proxy, Surface
 
@@ -276,3 +277,28 @@ def test_a_rough_object_gets_through_clear_glass_what_it_gets_without() -> None:
     spread = np.sqrt(first + second)[-1]
     assert np.all(np.abs(behind - free)[-1] < 4 * spread)
     assert np.all(spread < free[-1] / 30)
+
+
+def test_variance_holds_the_noise_of_thrown_light() -> None:
+    """By two halves, against the scatter of 16 independent pairs; sums over the picture, of thrown light and of all.
+
+    A variance of 16 scatters by 37 % in one pixel and hundreds of pixels share the noise: 4 %, and what is noted as
+    much; four times their root sum of squares is 0.2. Measured: 1.02. With strata in the paths from the camera the
+    whole is noted 13 % too large; thrown light is 73 % of it, and was not noted at all before.
+    """
+    light = sky()
+    worlds = build_worlds(ground(), ALBEDO, light, throwing_objects(), emitters=[lamp_of(light)])
+    worlds = replace(worlds, photons=PHOTONS)
+    pixels = SIZE[0] * SIZE[1]
+    noted, found = [], []
+    for seed in range(0, 64, 4):
+        first, second = (trace(difference_block, worlds, all_rays(), SAMPLES, 16, seed + half) for half in range(2))
+        lit = np.stack([cast(worlds, film(), SAMPLES, 1000 + seed + half).reshape(2, -1, 3) for half in range(2)])
+        halves = Halves(first, second, lit, 1, np.ones(pixels, bool))
+        alone = Halves(Samples.none(pixels), Samples.none(pixels), lit, 1, np.ones(pixels, bool))
+        noted.append([halves.both.change_variance.sum(), alone.both.change_variance.sum()])
+        found.append([halves.both.lost + halves.both.gained, lit.mean(0)[0]])
+    scatter = np.array([np.var([pair[kind] for pair in found], 0, ddof=1).sum() for kind in range(2)])
+    whole, thrown_part = np.mean(noted, 0) / scatter
+    assert thrown_part == pytest.approx(1, abs=0.2)
+    assert 0.8 < whole < 1.6

@@ -64,7 +64,7 @@ FEW_NOISY = 0.02  # of the cells
 CALM = 0.25  # of the tolerance of interpolation: noise of the pilot that need not be less
 STRATA = 3  # along a cell's side, for a pilot of few samples
 GLANCE_SAMPLES = 2  # of a square; as many as the first pass takes, so that kernels are compiled once
-GLANCED, REFINED = 95_001, 96_001  # seeds, far from those of the passes
+GLANCED, REFINED, THROWN = 95_001, 96_001, 97_001  # seeds, far from those of the passes
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
 JUDGE_SAMPLES = 10  # samples per pixel that cost about four times as much as judging its noise
 PILOT_PHOTONS = 1 / 48  # samples' worth of photons over the pilot's samples of a cell
@@ -188,7 +188,7 @@ def prepare(
     region, left = plan(pilot.samples, pilot.model, pilot.grid, shape, limits, pilot.glanced)
     if effort.strategy == "reference" or not effort.adaptive:
         region = replace(region, traced=region.weight > 0)
-    share = float(pilot.thrown.sum() / max(pilot.samples.gained.sum(), 1e-30))
+    share = float(pilot.thrown[0].sum() / max(pilot.samples.gained.sum(), 1e-30))
     if share < WORTH_TRACING:
         film, worlds = None, replace(worlds, photons=0.0)
     if film is not None:
@@ -219,7 +219,8 @@ class Pilot:
     worlds: Worlds
     samples: Samples  # thrown light in it
     model: np.ndarray  # (cells, 3) expected LS_noobj
-    thrown: np.ndarray  # (cells, 3) what light tracing finds
+    thrown: np.ndarray  # (2, cells, 3) what light tracing finds, local and on objects (none), and its variance
+    thrown_variance: np.ndarray
     glanced: np.ndarray  # (cells,) bool
     grid: tuple[int, int]
     index: np.ndarray  # (cells,) flat index of the pixel in the middle
@@ -249,7 +250,7 @@ def settled(canvas: Canvas, progress: Callable[[float], None]) -> Canvas:
     seed = effort.stream + REFINED
     rays = canvas.rays[pilot.index[cells]]
     more = trace(difference_block, pilot.worlds, rays, rest, effort.depth, seed, CELL, progress)
-    samples = pilot.samples.placed(cells, replace(more, gained=more.gained + pilot.thrown[cells]))
+    samples = pilot.samples.placed(cells, more.lit(pilot.thrown[:, cells], pilot.thrown_variance[:, cells]))
     found = of_cells(samples, pilot.model, pilot.grid, pilot.glanced)
     lost, gained, variance = in_pixels(found, canvas.shape, canvas.window)
     return replace(canvas, region=replace(region, lost=lost, gained=gained, variance=variance))
@@ -274,7 +275,8 @@ def looked(
     index, grid = cell_pixels(*shape)
     squares, coarse = cell_pixels(*shape, GLANCE * CELL)
     square = (np.arange(grid[0])[:, None] // GLANCE * coarse[1] + np.arange(grid[1]) // GLANCE).ravel()  # of each cell
-    bounces = light_by_cell(worlds, film, grid, effort) if film is not None else np.zeros((len(index), 3))
+    none = np.zeros((2, len(index), 3))
+    light_thrown, spread = light_by_cell(worlds, film, grid, effort) if film is not None else (none, none)
 
     def traced(seen: Rays, samples: int, seed: int, side: float) -> Samples:
         return trace(difference_block, worlds, seen, samples, effort.depth, effort.stream + seed, side, progress)
@@ -282,7 +284,7 @@ def looked(
     closed = worlds.convex and worlds.diffuse
     seen = rays[squares]
     glance = traced(seen, GLANCE_SAMPLES, GLANCED, GLANCE * CELL)[square]
-    glance = replace(glance, gained=glance.gained + bounces)
+    glance = glance.lit(light_thrown, spread)
     if closed:
         cell_light = np.broadcast_to(light, (len(index), 3))
     else:
@@ -297,7 +299,7 @@ def looked(
             found = traced(parts, GLANCE_SAMPLES, 1, CELL / STRATA).gathered(STRATA**2)
         else:
             found = traced(rays[index[some]], pilot_samples(effort), 1, CELL)
-        samples = glance.replaced(some, replace(found, gained=found.gained + bounces[some]))
+        samples = glance.replaced(some, found.lit(light_thrown[:, some], spread[:, some]))
     if not closed and len(some):
         part = np.ix_(*(np.arange(there.min(), there.max() + 1) for there in np.nonzero(wanted.reshape(grid))))
         inside = np.arange(len(index)).reshape(grid)[part]
@@ -305,23 +307,28 @@ def looked(
             worlds, rays[index[inside.ravel()]], inside.shape, pilot_samples(effort), effort, CELL
         )
     model = samples.albedo * cell_light / np.pi
-    return Pilot(worlds, samples, model, bounces, ~wanted, grid, index, limits.tolerance)
+    return Pilot(worlds, samples, model, light_thrown, spread, ~wanted, grid, index, limits.tolerance)
 
 
-def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> np.ndarray:
-    """(cells, 3) mean radiance of the local scene by what emitters send there by way of objects."""
+def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> tuple[np.ndarray, np.ndarray]:
+    """(2, cells, 3) mean radiance of the local scene, and none of objects, by what emitters send there by way of
+    objects; and the variance of that, by two halves.
+    """
     height, width = film.shape
 
     def cell(pixel: np.ndarray) -> np.ndarray:
         row, column = np.divmod(pixel, width)
         return np.asarray(row // CELL * grid[1] + column // CELL)
 
-    samples = PILOT_PHOTONS * pilot_samples(effort)
-    total = thrown(worlds, film, samples, effort.stream + 1, cell, grid[0] * grid[1])[0]
+    samples = PILOT_PHOTONS * pilot_samples(effort) / 2
+    seeds = (effort.stream + 1, effort.stream + THROWN)
+    halves = np.stack([thrown(worlds, film, samples, seed, cell, grid[0] * grid[1]) for seed in seeds])
+    halves[:, 1] = 0
     rows, columns = (
         np.minimum(CELL, size - CELL * np.arange(n)) for size, n in zip((height, width), grid, strict=True)
     )
-    return np.asarray(total / (rows[:, None] * columns).reshape(-1, 1))
+    halves /= (rows[:, None] * columns).reshape(-1, 1)
+    return halves.mean(0), (halves[0] - halves[1]) ** 2 / 4
 
 
 def received(

@@ -45,17 +45,22 @@ class Halves:
     @property
     def a(self) -> Samples:
         """One half."""
-        return lit_by(self.first, self.thrown[0])
+        return self.first.lit(self.thrown[0], 2 * self.thrown_variance)
 
     @property
     def b(self) -> Samples:
         """The other."""
-        return lit_by(self.second, self.thrown[1])
+        return self.second.lit(self.thrown[1], 2 * self.thrown_variance)
 
     @property
     def both(self) -> Samples:
         """All samples."""
-        return lit_by(self.first + self.second, self.thrown.mean(0))
+        return (self.first + self.second).lit(self.thrown.mean(0), self.thrown_variance)
+
+    @property
+    def thrown_variance(self) -> np.ndarray:
+        """(2, N, 3) of the mean of both halves' thrown light, as their difference shows it: one degree of freedom."""
+        return np.asarray((self.thrown[0] - self.thrown[1]) ** 2 / 4)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -70,11 +75,6 @@ class Halves:
             Samples(**{f.name: arrays[f"{half}_{f.name}"] for f in fields(Samples)}) for half in ("first", "second")
         )
         return cls(first, second, arrays["thrown"], int(arrays["passes"]), arrays["open"])
-
-
-def lit_by(samples: Samples, thrown: np.ndarray) -> Samples:
-    """Samples of pixels with light traced to the local scene and to objects there, (2, N, 3)."""
-    return replace(samples, gained=samples.gained + thrown[0], obj=samples.obj + thrown[1])
 
 
 def schedule(samples: int) -> tuple[list[int], int]:

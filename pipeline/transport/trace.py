@@ -10,7 +10,7 @@ strategy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -144,6 +144,17 @@ class Samples:
             share = own if a.ndim == 1 else own[:, None]
             blended[name] = a * share + b * (1 - share)
         return Samples(**blended)
+
+    def lit(self, light: np.ndarray, variance: np.ndarray) -> Samples:
+        """With light (2, N, 3) that was traced from emitters to the local scene and to objects, and its variance.
+
+        It knows nothing of the paths from the camera: variances of the means add.
+        """
+        free = np.maximum(self.count - 1, 1)[:, None]
+        change, gained, obj = self.lost + self.gained, self.gained + light[0], self.obj + light[1]
+        change_square = self.change_square + (change + light[0]) ** 2 - change**2 + free * variance[0]
+        obj_square = self.obj_square + obj**2 - self.obj**2 + free * variance[1]
+        return replace(self, gained=gained, obj=obj, change_square=change_square, obj_square=obj_square)
 
     def gathered(self, each: int) -> Samples:
         """Every ``each`` pixels, of as many samples, as if they were one."""
