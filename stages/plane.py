@@ -141,8 +141,10 @@ def beside(
             why = f"it is proxy {row['described']}"
         elif params.find_proxies == "never":
             why = "plane.find_proxies = never"
-        elif row["change_max"] < params.left_out:
-            why = f"the objects change it by {row['change_max']:.2%} at most"
+        elif row["change"] < params.left_out:
+            why = f"less than plane.left_out, {params.left_out:.1%}"
+        elif not row["seen_px"]:
+            why = "the plate does not show it"
         else:
             why = ""
         wanted = not row["described"] and params.find_proxies == "always"
@@ -176,7 +178,8 @@ def against_cloud(
         )
     sigma = np.sqrt(np.diag(found.covariance))
     return {
-        "points": found.points, "normal": found.normal.tolist(), "tilt_deg": float(np.degrees(np.hypot(*found.fit[:2]))),
+        "points": found.points, "normal": found.normal.tolist(),
+        "tilt_deg": float(np.degrees(np.hypot(*found.fit[:2]))),
         "offset_m": float(found.fit[2]), "offset_sigma_m": float(sigma[2]),
         "tilt_sigma_deg": float(np.degrees(np.hypot(*sigma[:2]))),
         "scatter_m": found.scatter_m, "uneven_m": found.uneven_m, "chi2": chi2, "agrees": chi2 <= AGREE_CHI2,
@@ -358,10 +361,13 @@ def beside_evidence(proxies: list[Proxy], surfaces: list[dict[str, Any]] | None)
     missing = "shadows on them and their light on the objects are missing"
     if surfaces is None:
         return {**term, "modelled": bool(proxies), "because": stated, "could_cost": "" if proxies else missing}
-    rows = [f"{row['name']} ({1e4 * row['area_m2']:.0f} cm2, {row['distance_m']:.2f} m off, change up to "
-            f"{row['change_max']:.1%}): {row['because'] or 'modelled'}" for row in surfaces]  # fmt: skip
+    rows = [
+        f"{row['name']} ({1e4 * row['area_m2']:.0f} cm2, {row['distance_m']:.2f} m off, changed by {row['change']:.1%} "
+        f"and at most {row['change_bound']:.0%}): {row['because'] or 'modelled'}"
+        for row in surfaces
+    ]
     found = "; ".join(rows) or "no flat surface stands out of the cloud"
-    left = [row["change_max"] for row in surfaces if not row["modelled"] and not row["described"]]
+    left = [row["change"] for row in surfaces if not row["modelled"] and not row["described"]]
     cost = f"changes of up to {max(left):.1%} on surfaces left out" if left else "backs and sides that no view shows"
     modelled = bool(proxies) or any(row["modelled"] for row in surfaces)
     return {**term, "modelled": modelled, "because": f"{stated}; {found}", "could_cost": cost}

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.transport.extent import FAR_SEEN, Standing, beyond, far_ground, needed
-from pipeline.transport.influence import influence, light_on, reach
+from pipeline.transport.influence import expected, influence, light_on, reach
 from pipeline.transport.proxies import box
 from pipeline.types import Emitter
 
@@ -116,6 +116,20 @@ def test_the_rectangle_holds_what_changes_and_its_border_says_what_it_cuts() -> 
     _, cut = beyond(corners * 0.2, things, light)
     assert cut.max() > 0.004
     assert np.isfinite(border).all()
+
+
+def test_what_is_to_be_expected_of_a_ball() -> None:
+    """Black under an even sky: the configuration factor. As white as the sky: nothing. Never more than the bound."""
+    points, ball = np.array([[0.5, 0, 0.0], [0, 0, -2.0]]), np.array([0, 0.3, 0, 0.1])
+    light = light_on(UP, EVEN, [])
+    bound = influence(points, ball[None], light)
+    np.testing.assert_allclose(expected(points, ball, light, np.zeros(3)), bound, rtol=1e-3)
+    np.testing.assert_allclose(expected(points, ball, light, np.ones(3)), 0, atol=2e-3 * bound.max())
+    lit, sun = with_sun(30.0, 0.5)
+    spots = np.random.default_rng(2).uniform(-1, 1, (200, 3)) * (1, 0, 1)
+    under = light_on(UP, lit, sun)
+    for albedo in (0.0, 0.5, 1.0):
+        assert (expected(spots, ball, under, np.full(3, albedo)) <= influence(spots, ball[None], under) + 1e-12).all()
 
 
 def test_a_surface_behind_an_object_is_not_touched() -> None:

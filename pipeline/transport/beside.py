@@ -11,7 +11,7 @@ from pipeline.camera.lens import project
 from pipeline.camera.planes_in_cloud import Found
 from pipeline.camera.rigid import camera_points
 from pipeline.transport.extent import Standing
-from pipeline.transport.influence import influence, light_on
+from pipeline.transport.influence import expected, influence, light_on
 from pipeline.types import Camera, Emitter, Proxy, View
 
 GRID = 8  # points along each side of a surface
@@ -24,15 +24,16 @@ def weighed(
 ) -> dict[str, Any]:  # fmt: skip
     """What a found surface is and what the objects can change on it, as written into the record.
 
-    ``change_max``, ``change_mean``: bound on the relative change of its light, over the outline. ``seen_px``: area of
-    its outline in the plate [px], 0 when it faces away. ``of_object``: the share of the nearest object's surroundings
-    (4 pi) that it fills.
+    ``change``: largest relative change of its light to be expected, of diffuse balls in the objects' place, and
+    ``change_bound`` what it cannot exceed. ``seen_px``: area of its outline in the plate [px], 0 when it faces away.
+    ``of_object``: the share of the nearest object's surroundings (4 pi) that it fills.
     """
     points = over(surface.corners_m)
     light = light_on(surface.normal, environment, emitters)
-    change = np.zeros(len(points))
+    bound, change = np.zeros(len(points)), np.zeros(len(points))
     for thing in objects:
-        change += influence(points, thing.sphere[None], light, thing.emission)
+        bound += influence(points, thing.sphere[None], light, thing.emission)
+        change += expected(points, thing.sphere, light, thing.albedo, thing.emission)
     centres = np.array([thing.sphere[:3] for thing in objects]).reshape(-1, 3)
     arms = points[None] - centres[:, None]
     distance = np.linalg.norm(arms, axis=2)
@@ -42,8 +43,8 @@ def weighed(
         "area_m2": surface.area_m2, "normal": surface.normal.tolist(), "corners_m": surface.corners_m.tolist(),
         "points": len(surface.members), "normal_sigma_deg": surface.sigma_deg, "place_sigma_m": surface.sigma_m,
         "scatter_m": surface.fit.scatter_m, "distance_m": float(distance.min(initial=np.inf)),
-        "of_object": float(filled.max(initial=0.0)), "change_max": float(change.max()),
-        "change_mean": float(change.mean()), "seen_px": seen_px(surface, camera, view),
+        "of_object": float(filled.max(initial=0.0)), "change_bound": float(bound.max()),
+        "change": float(change.max()), "seen_px": seen_px(surface, camera, view),
         "described": described(points, surface, proxies),
     }  # fmt: skip
 

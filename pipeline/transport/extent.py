@@ -8,28 +8,33 @@ lies less than `FAR_SEEN` of what its upright faces see: there the map shows tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.transport.influence import Fall, influence, reach
-from pipeline.transport.meshes import load_meshes
+from pipeline.transport.meshes import Material, load_meshes
 from pipeline.transport.placing import world_from_object
 from pipeline.types import Plane
 
 FAR_SEEN = 0.05  # of what an upright face at an object's middle sees; measured on both captures, see `far_ground`
+METAL = 0.8  # of a polished metal, roughly
 BORDER = 64  # points along each side of the rectangle
 
 
 @dataclass(frozen=True)
 class Standing:
-    """An object as a sphere (4,: centre, radius; m, world) around its bounding box, and what it emits (1 is white)."""
+    """An object as a sphere (4,: centre, radius; m, world) around its bounding box, and what it emits (1 is white).
+
+    ``albedo`` (3,): roughly, the mean of its materials' colours.
+    """
 
     name: str
     sphere: np.ndarray
     emission: float = 0.0
+    albedo: np.ndarray = field(default_factory=lambda: np.full(3, 0.5))
 
 
 def standing(wishes: dict[str, Any], plane: Plane, size_m: float) -> list[Standing]:
@@ -48,10 +53,20 @@ def standing(wishes: dict[str, Any], plane: Plane, size_m: float) -> list[Standi
         world = corners @ placed[:3, :3].T + placed[:3, 3]
         centre = (world.min(0) + world.max(0)) / 2
         radius = float(np.linalg.norm(world - centre, axis=1).max())
-        given = (wish.get("material") or {}).get("emission")
-        emission = max(given) if given else max(max(part.material.emission) for part in meshes)
-        found.append(Standing(wish["name"], np.array([*centre, radius]), float(emission)))
+        given = {key: value for key, value in (wish.get("material") or {}).items() if key != "space"}
+        materials = [Material(**given)] if given else [part.material for part in meshes]
+        emission = max(max(material.emission) for material in materials)
+        albedo = np.mean([mean_color(material) for material in materials], 0)
+        found.append(Standing(wish["name"], np.array([*centre, radius]), float(emission), albedo))
     return found
+
+
+def mean_color(material: Material) -> np.ndarray:
+    """(3,) base colour with its texture, METAL for a metal by name; colour spaces are not told apart."""
+    if material.conductor:
+        return np.full(3, METAL)
+    texture = 1.0 if material.base_texture is None else material.base_texture.reshape(-1, 3).mean(0)
+    return np.asarray(np.array(material.shown_color) * texture)
 
 
 def far_ground(height_m: float) -> float:

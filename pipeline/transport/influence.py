@@ -33,7 +33,7 @@ class Fall:
 
     ``sky`` (T, 3): pi times the radiance of each texel (directions ``toward`` (T, 3)) without the emitters;
     ``lamps`` (L, 3): share that each emitter gives, from ``lamp_toward`` (L, 3), discs of ``lamp_half`` (L,) rad;
-    ``best`` (3,): largest irradiance on a surface of any orientation.
+    ``sides`` (S, 3): irradiance on surfaces of normals ``side_normal`` (S, 3), of all orientations.
     """
 
     normal: np.ndarray
@@ -42,7 +42,8 @@ class Fall:
     lamps: np.ndarray
     lamp_toward: np.ndarray
     lamp_half: np.ndarray
-    best: np.ndarray
+    sides: np.ndarray
+    side_normal: np.ndarray
 
 
 def light_on(normal: np.ndarray, environment: np.ndarray, emitters: Sequence[Emitter]) -> Fall:
@@ -53,7 +54,7 @@ def light_on(normal: np.ndarray, environment: np.ndarray, emitters: Sequence[Emi
     coarse = resize_environment(sky.reshape(environment.shape), ROWS, 2 * ROWS)
     whole = resize_environment(np.asarray(environment, float), ROWS, 2 * ROWS)
     fall = np.maximum(irradiance(environment, normal[None])[0], 1e-30)
-    sides = latlong_directions(SIDES, 2 * SIDES).reshape(-1, 3)
+    sides = np.concatenate([latlong_directions(SIDES, 2 * SIDES).reshape(-1, 3), normal[None]])
     lamps = np.array([e.irradiance * max(float(e.direction @ normal), 0.0) for e in emitters]).reshape(-1, 3)
     return Fall(
         normal,
@@ -62,7 +63,8 @@ def light_on(normal: np.ndarray, environment: np.ndarray, emitters: Sequence[Emi
         lamps / fall,
         np.array([e.direction for e in emitters]).reshape(-1, 3),
         np.array([e.half_angle_rad for e in emitters]),
-        np.maximum(irradiance(whole, sides).max(0), fall) / fall,
+        irradiance(whole, sides) / fall,
+        sides,
     )
 
 
@@ -95,8 +97,33 @@ def _of_sphere(points: np.ndarray, centre: np.ndarray, radius: float, light: Fal
     for share, toward, wide in zip(light.lamps, light.lamp_toward, light.lamp_half, strict=True):
         met = np.arccos(np.clip(way @ toward, -1, 1)) < half + wide
         lost += (met * np.minimum((half / max(wide, 1e-9)) ** 2, 1.0))[:, None] * share
-    gained = covered * (light.best + emission)
+    gained = covered * (light.sides.max(0) + emission)
     return np.where(above > -radius, np.maximum(np.minimum(lost, 1.0), gained).max(1), 0.0)
+
+
+def expected(
+    points: np.ndarray, sphere: np.ndarray, light: Fall, albedo: np.ndarray, emission: float = 0.0
+) -> np.ndarray:
+    """(N,) relative change of irradiance at points (N, 3) that a diffuse ball (4: centre, radius) would make.
+
+    Not a bound: what the ball sends back, lit as its visible side is on average and of ``albedo`` (3,), less what it
+    hides on average. For an object of another shape, or a shiny one, an order of magnitude.
+    """
+    arm, above = sphere[:3] - points, (sphere[:3] - points) @ light.normal
+    arm = arm + np.maximum(sphere[3] - above, 0)[:, None] * light.normal
+    distance = np.linalg.norm(arm, axis=1)
+    way = arm / distance[:, None]
+    half = np.arcsin(np.minimum(sphere[3] / distance, 1.0))
+    covered = ((sphere[3] / distance) ** 2 * (way @ light.normal))[:, None]
+    behind = way @ light.toward.T > np.cos(np.minimum(half + np.pi / ROWS / np.sqrt(2), np.pi))[:, None]
+    lost = covered * (behind @ light.sky) / np.maximum(behind.sum(1, keepdims=True), 1)
+    for share, toward, wide in zip(light.lamps, light.lamp_toward, light.lamp_half, strict=True):
+        met = np.arccos(np.clip(way @ toward, -1, 1)) < half
+        lost += (met * np.minimum((half / max(wide, 1e-9)) ** 2, 1.0))[:, None] * share
+    facing = np.maximum(-way @ light.side_normal.T, 0)
+    lit = (facing @ light.sides) / np.maximum(facing.sum(1, keepdims=True), 1e-12)
+    gained = covered * (albedo * lit + emission)
+    return np.where(above > -sphere[3], np.abs(gained - np.minimum(lost, 1.0)).max(1), 0.0)
 
 
 def reach(sphere: np.ndarray, light: Fall, threshold: float, most: float, emission: float = 0.0) -> np.ndarray:
