@@ -43,7 +43,9 @@ def test_regions_hold_the_truth_and_noise_is_found() -> None:
     assert inside >= 0.79, chi2  # binomial: 24 trials at 95 % give fewer than 19 once in 1600
     assert 4.0 < np.mean(chi2) < 9.0  # 6 expected, its standard error 0.7; Huber widens by 5 %
     assert np.median([one.track_sigma_px for one in done]) == pytest.approx(TRACK_PX, rel=0.1)
-    assert np.median([one.corner_sigma_px for one in done]) == pytest.approx(CORNER_PX, rel=0.15)
+    # 79 of 112 coordinates are spare: 8 % each, 2 % for the median of 24. With 100 spare, as if tracks alone held the
+    # views, it was 11 % low, and of 240 regions 89 % held the truth; now 92 %.
+    assert np.median([one.corner_sigma_px for one in done]) == pytest.approx(CORNER_PX, rel=0.06)
 
 
 def test_beats_a_similarity_alone() -> None:

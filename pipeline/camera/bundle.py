@@ -137,7 +137,8 @@ def adjust(
         return _finish(bundle, start, layout, priors, anchor, like.used, (like.track_sigma_px, like.corner_sigma_px))
     for _ in range(3):  # noise, then outliers, then the fit, until they agree
         bundle = _descend(bundle, start, layout, priors, anchor, used, sigma)
-        sigma = _noise(bundle, used, corner_sigma_px, layout)
+        fixed = _fixed_by_corners(bundle, start, layout, priors, anchor, used, sigma)
+        sigma = _noise(bundle, used, corner_sigma_px, layout, fixed)
         distance = np.hypot(*_residuals(bundle)[: len(bundle.px)].T)
         used = np.where(np.isfinite(distance), distance, np.inf) <= GATE * sigma[0]
         # one sighting does not place a point: its block would be singular, and its rounding would spoil the others'
@@ -402,22 +403,42 @@ def _descend(
     return bundle
 
 
-def _noise(bundle: Bundle, used: np.ndarray, corner_sigma_px: float | None, layout: _Layout) -> tuple[float, float]:
-    """Standard deviation of a coordinate of the tracks and of the corners, freedom taken off by redundancy.
+def _fixed_by_corners(
+    bundle: Bundle, start: Bundle, layout: _Layout, priors: list[np.ndarray],
+    anchor: tuple[int, np.ndarray, float] | None, used: np.ndarray, sigma: tuple[float, float],
+) -> float:  # fmt: skip
+    """How many unknowns the markers' corners settle, beside the tracks, at a given noise.
 
-    A point seen n times leaves 2 n - 3 of its 2 n coordinates; the poses take few of the tracks' many.
+    The trace of their part of the normal matrix over the whole (Foerstner 1979, variance components): corners are few
+    and sharp, so they take more of the poses than their number says, and their residuals are smaller for it.
+    """
+    terms = _terms(bundle)
+    own, _ = _marker_equations(terms, _weights(terms, used, sigma), bundle, layout)
+    reduced, _, _ = _reduce(_system(bundle, start, layout, priors, anchor, used, sigma), 1e-9)
+    return float(np.trace(np.linalg.solve(reduced, own)))
+
+
+def _noise(
+    bundle: Bundle, used: np.ndarray, corner_sigma_px: float | None, layout: _Layout, fixed: float
+) -> tuple[float, float]:
+    """Standard deviation of a coordinate of the tracks and of the corners, by the redundancy of each.
+
+    A point seen n times leaves 2 n - 3 of its 2 n coordinates, so that its residuals are smaller than the noise by
+    their own factor; of the other unknowns ``fixed`` are taken from the corners, the rest from the tracks.
     """
     residuals = _residuals(bundle)
     count = len(used)
-    track = residuals[:count][used]
     seen = np.bincount(bundle.seen_point[used], minlength=len(bundle.points))
-    freedom = max((2 * used.sum() - 3 * (seen > 0).sum() - layout.size) / max(2 * used.sum(), 1), 0.05)
-    spread = float(1.4826 * np.median(np.abs(track))) / np.sqrt(freedom) if used.any() else 0.0
+    spread = 0.0
+    if used.any():
+        track = residuals[:count][used] / np.sqrt(1 - 1.5 / seen[bundle.seen_point[used]])[:, None]
+        spare = 2 * used.sum() - 3 * (seen > 0).sum()
+        freedom = max(1 - (layout.size - fixed) / max(spare, 1), 0.05)
+        spread = float(1.4826 * np.median(np.abs(track))) / np.sqrt(freedom)
     corners = residuals[count:]
     if corner_sigma_px is not None or len(corners) < 12:
         return max(spread, TRACK_FLOOR_PX), corner_sigma_px or 0.1
-    taken = 6 * len(bundle.markers) if count else layout.size  # the tracks hold the views, where there are any
-    measured = float(np.sqrt((corners**2).mean() * corners.size / max(corners.size - taken, 6)))
+    measured = float(np.sqrt((corners**2).sum() / max(corners.size - fixed, 6)))
     return max(spread, TRACK_FLOOR_PX), max(measured, CORNER_FLOOR_PX)
 
 
