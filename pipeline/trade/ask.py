@@ -130,9 +130,10 @@ def check(question: Question, found: Model, setting: Setting, pilot: Mapping[str
     if question.max_error is not None and error > question.max_error:
         least = math.ceil(error * 1e4) / 1e4
         which = "the finest setting, as final's" if setting == FINEST else "the finest that the given knobs leave"
+        which += f" ({setting.samples} samples, a map of {setting.width} px)"
         raise ManifestError(
-            f"--max-error: is {question.max_error:g}; {which} ({setting.samples} samples, a map of {setting.width} px), is "
-            f"predicted to err by {error:.4f}, most of it {largest(found, setting)}; ask {least:g} or more"
+            f"--max-error: is {question.max_error:g}; {which}, is predicted to err by {error:.4f}, "
+            f"most of it {largest(found, setting)}; ask {least:g} or more"
         )
     if question.time_budget is not None and seconds > question.time_budget:
         where = f" for an error of {question.max_error:g}" if question.max_error is not None else ""
