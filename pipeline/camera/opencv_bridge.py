@@ -194,16 +194,31 @@ def marker_cells(name: str) -> int:
 
 
 def planar_poses(flat: np.ndarray, xy: np.ndarray) -> list[np.ndarray]:
-    """Both ``camera_from_plane`` (4, 4) of points (N, 2) in the plane z = 0 at normalised coordinates (N, 2) (IPPE)."""
+    """Both ``camera_from_plane`` (4, 4) of points (N, 2) in the plane z = 0 at normalised coordinates (N, 2) (IPPE).
+
+    Seen exactly squarely it divides zero by zero; a camera turned about its own centre then sees the same points.
+    """
+    poses = _ippe(flat, xy, np.eye(3))
+    if np.isfinite(poses).all():
+        return poses
+    cosine, sine = np.cos(0.1), np.sin(0.1)
+    return _ippe(flat, xy, np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]))
+
+
+def _ippe(flat: np.ndarray, xy: np.ndarray, turned_from_camera: np.ndarray) -> list[np.ndarray]:
+    """`planar_poses` by way of a camera that is turned by a rotation (3, 3)."""
     import cv2
 
     points = np.concatenate([flat, np.zeros((len(flat), 1))], -1)
+    if not np.array_equal(turned_from_camera, np.eye(3)):
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], -1) @ turned_from_camera.T
+        xy = rays[:, :2] / rays[:, 2:]
     _, rotations, translations, _ = cv2.solvePnPGeneric(points, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     poses = []
     for rotation, translation in zip(rotations, translations, strict=True):
         pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(rotation)[0]
-        pose[:3, 3] = np.ravel(translation)
+        pose[:3, :3] = turned_from_camera.T @ cv2.Rodrigues(rotation)[0]
+        pose[:3, 3] = turned_from_camera.T @ np.ravel(translation)
         poses.append(pose)
     return poses
 
