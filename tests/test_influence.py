@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from test_composite_render import wish
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
-from pipeline.transport.extent import FAR_SEEN, Standing, beyond, far_ground, needed
+from pipeline.transport.extent import FAR_SEEN, Standing, beyond, far_ground, needed, standing
 from pipeline.transport.influence import expected, influence, light_on, reach
 from pipeline.transport.proxies import box
-from pipeline.types import Emitter
+from pipeline.types import Emitter, Plane
 
 UP = np.array([0.0, 1.0, 0.0])
 EVEN = np.ones((64, 128, 3))
@@ -130,6 +131,19 @@ def test_what_is_to_be_expected_of_a_ball() -> None:
     under = light_on(UP, lit, sun)
     for albedo in (0.0, 0.5, 1.0):
         assert (expected(spots, ball, under, np.full(3, albedo)) <= influence(spots, ball[None], under) + 1e-12).all()
+
+
+def test_objects_are_spheres_of_their_files(tmp_path) -> None:
+    """A ball's own sphere whatever its yaw and scale; colour and emission of the material."""
+    level = Plane(normal=UP, offset_m=0.0, covariance=np.zeros((3, 3)), corners_m=np.zeros((4, 3)), source="test")
+    lamp = wish(tmp_path, 0.2, base_color=[0.2, 0.4, 0.6], emission=[0.0, 3.0, 1.0]) | {"yaw_deg": 30.0, "scale": 2.0}
+    (found,) = standing({"object": [lamp]}, level, 0.1)
+    np.testing.assert_allclose(found.sphere, [0.2, 0.09, 0.0, 0.16], atol=1e-6)
+    assert (found.emission, found.albedo.tolist()) == (3.0, [0.2, 0.4, 0.6])
+    gold = wish(tmp_path, 0.2, conductor="gold")
+    assert standing({"object": [gold]}, level, 0.1)[0].albedo.min() > 0.5
+    (bare,) = standing({"object": [{"name": "a", "position_m": (0.1, 0.3)}]}, level, 0.1)
+    np.testing.assert_allclose(bare.sphere, [0.1, 0.05, 0.3, 0.05])
 
 
 def test_a_surface_behind_an_object_is_not_touched() -> None:

@@ -26,7 +26,7 @@ BORDER = 64  # points along each side of the rectangle
 
 @dataclass(frozen=True)
 class Standing:
-    """An object as a sphere (4,: centre, radius; m, world) around its bounding box, and what it emits (1 is white).
+    """An object as a sphere (4,: centre, radius; m, world) around its middle, and what it emits (1 is white).
 
     ``albedo`` (3,): roughly, the mean of its materials' colours.
     """
@@ -47,12 +47,9 @@ def standing(wishes: dict[str, Any], plane: Plane, size_m: float) -> list[Standi
             continue
         meshes = load_meshes(Path(wish["path"]))[0]
         placed = world_from_object(wish, plane)
-        ends = [np.array([part.vertices.min(0), part.vertices.max(0)]) for part in meshes]
-        low, high = np.min(ends, 0)[0], np.max(ends, 0)[1]
-        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-        world = corners @ placed[:3, :3].T + placed[:3, 3]
+        world = np.concatenate([part.vertices for part in meshes]) @ placed[:3, :3].T + placed[:3, 3]
         centre = (world.min(0) + world.max(0)) / 2
-        radius = float(np.linalg.norm(world - centre, axis=1).max())
+        radius = float(np.sqrt(((world - centre) ** 2).sum(1).max()))
         given = {key: value for key, value in (wish.get("material") or {}).items() if key != "space"}
         materials = [Material(**given)] if given else [part.material for part in meshes]
         emission = max(max(material.emission) for material in materials)
