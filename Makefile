@@ -73,6 +73,9 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
+extremes: $(READY)  ## run every case of tests/extremes/cases.toml, into docs/numerics.md, numerics.json and formulas.json
+	$(VENV)/bin/python -m pytest -m extreme --extremes docs
+
 trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/<capture>/trade (an hour or more)
 	@$(INSITU) trade $(CAPTURE) --out $(OUT)
 
@@ -92,6 +95,9 @@ bench-colour: $(READY)  ## measure colours of measured cameras against spectra, 
 bench-skylibs-env:  ## skylibs for bench-probe, in .skylibs
 	@test -x .skylibs/bin/python || python3 -m venv --without-pip .skylibs
 	python3 -m pip --python .skylibs/bin/python install --quiet skylibs
+
+bench-budget: $(READY)  ## do stated uncertainties hold, over re-simulated captures, for docs/benchmarks (BENCH=100; hours)
+	@$(VENV)/bin/python -m benchmarks.budget $(BENCH)
 
 bench-merge: $(READY)  ## measure the merge against the noise bound, memory bandwidth and peers, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.merge $(BENCH)
@@ -115,4 +121,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: trade speed bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: extremes trade speed bench-budget bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
