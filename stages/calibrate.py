@@ -24,13 +24,14 @@ import numpy as np
 
 from pipeline.camera import board_doubts
 from pipeline.camera.adjustment import Adjustment
+from pipeline.camera.board_kinds import sightings_of
 from pipeline.camera.board_pictures import board_picture
 from pipeline.camera.distortion import model_of
 from pipeline.camera.exif_camera import exif_camera
 from pipeline.camera.former_camera import reused
 from pipeline.camera.given_camera import given_camera
 from pipeline.camera.lens_ladder import FEWEST_PHOTOS, SURE, Photos, best_lens
-from pipeline.camera.opencv_bridge import Sightings, board_sightings
+from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
 from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
@@ -157,7 +158,7 @@ def sight(
 
     def look(file: str) -> tuple[tuple[int, int], Sightings]:
         plain, precise = board_picture(root / file)
-        return (plain.shape[1], plain.shape[0]), board_sightings(plain, precise, facts["board"])
+        return (plain.shape[1], plain.shape[0]), sightings_of(plain, precise, facts["board"])
 
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # OpenCV releases the GIL
         found = list(pool.map(look, files))

@@ -39,6 +39,29 @@ def charuco_print(board: dict) -> tuple[np.ndarray, float, np.ndarray]:
     return made.generateImage(size, marginSize=0), per_square / board["square_m"], np.zeros(2)
 
 
+def grid_print(board: dict) -> tuple[np.ndarray, float, np.ndarray]:
+    """The same for a grid of markers, each in the middle of its white cell, ids row by row."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board["dictionary"]))
+    cells = dictionary.markerSize + 2
+    side = 12 * cells
+    pitch = round(side * board["square_m"] / board["marker_m"] / 2) * 2
+    assert abs(pitch / side * board["marker_m"] / board["square_m"] - 1) < 1e-9  # nothing is rounded
+    across, down = board["squares"]
+    picture, rim = np.full((down * pitch, across * pitch), 255, np.uint8), (pitch - side) // 2
+    for number in range(across * down):
+        y, x = number // across * pitch + rim, number % across * pitch + rim
+        marker = cv2.aruco.generateImageMarker(dictionary, board.get("first_id", 0) + number, side)
+        picture[y : y + side, x : x + side] = marker
+    return picture, pitch / board["square_m"], np.zeros(2)
+
+
+def chessboard_print(board: dict) -> tuple[np.ndarray, float, np.ndarray]:
+    """The same for a chessboard whose first square is black, in a white rim of one square."""
+    across, down = board["squares"]
+    squares = np.pad((np.indices((down, across)).sum(0) % 2 * 255).astype(np.uint8), 1, constant_values=255)
+    return np.kron(squares, np.ones((40, 40), np.uint8)), 40 / board["square_m"], np.full(2, -board["square_m"])
+
+
 def marker_print(marker: dict) -> tuple[np.ndarray, float, np.ndarray]:
     """The same for a single marker with two cells of white around."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, marker["dictionary"]))

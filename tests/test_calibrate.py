@@ -56,7 +56,7 @@ def run(monkeypatch: pytest.MonkeyPatch, corners: list[np.ndarray], sizes: list[
         calibrate, "board_picture", lambda path: (np.full(sizes[int(path.stem)], int(path.stem), np.uint8),) * 2
     )
     monkeypatch.setattr(
-        calibrate, "board_sightings",
+        calibrate, "sightings_of",
         lambda grey, _, board: Sightings(POINTS[: len(corners[grey[0, 0]])], corners[grey[0, 0]], np.arange(24), 17),
     )  # fmt: skip
     facts = {"capture_root": ".", "board": BOARD, "camera": {"calibration": ["*.jpg"], "given": None}}

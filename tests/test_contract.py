@@ -30,6 +30,7 @@ KNOW_STAGES = {"pipeline/run/cli.py"}
 BRIDGES = {
     "cv2": {
         "pipeline/camera/board_families.py",
+        "pipeline/camera/board_kinds.py",
         "pipeline/camera/opencv_bridge.py",
         "pipeline/image/alignment.py",
         "pipeline/image/chart_finder.py",

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.board_families import Layout, find_markers, layout_of
+from pipeline.camera.board_kinds import kind_of, points_on, turns_alike
 from pipeline.camera.bundle import Bundle, Corners
 from pipeline.camera.lens import pixel_rays, project, unproject
 from pipeline.camera.markers import tone
@@ -40,9 +41,9 @@ def of_board(pictures: Sequence[np.ndarray], board: dict[str, Any]) -> str:
         return _mirrored(pictures)
     if layout.name and layout.name != board.get("layout"):
         return f'its markers are those of insitu board: [board] layout = "{layout.name}"'
-    if layout.kind == "charuco" and not _is_stated(layout, board):
+    if layout.kind in ("charuco", "grid") and (layout.kind != kind_of(board) or not _is_stated(layout, board)):
         return f"what it shows fits {_spelled(layout)}"
-    if layout.kind in ("grid", "unknown") and not _same_family(layout, board["dictionary"]):
+    if layout.kind == "unknown" and not _same_family(layout, board["dictionary"]):
         return f"its markers are of {layout.dictionary}, [board] says {board['dictionary']}"
     return ""
 
@@ -82,6 +83,12 @@ def sighted(facts: dict[str, Any], route: str, radiance: np.ndarray, camera: Cam
         marker = facts["marker"][0]
         seen = sighted_marker(radiance, marker, camera)
         return seen if len(seen.px) else replace(seen, note=of_marker(eight_bit(tone(radiance)), marker))
+    if turns_alike(facts["board"]):
+        across, down = facts["board"]["squares"]
+        raise CaptureError(
+            f"the chessboard of {across} x {down} squares looks the same when turned by 180 degrees, needed one of an "
+            "even and an odd count; lay a [[marker]] and orient the views by [[pose]] route 'marker', or use another"
+        )
     seen = sighted_board(radiance, facts["board"], camera)
     if len(seen.twice) >= TWICE:
         ids = ", ".join(str(i) for i in seen.twice[:4]) + (", ..." if len(seen.twice) > 4 else "")
@@ -138,7 +145,8 @@ def _is_stated(layout: Layout, board: dict[str, Any]) -> bool:
 
 def _spelled(layout: Layout) -> str:
     legacy = ", legacy = true" if layout.legacy else ""
-    return f'dictionary = "{layout.dictionary}", squares = [{layout.squares[0]}, {layout.squares[1]}]{legacy}'
+    kind = 'kind = "grid", ' if layout.kind == "grid" else ""
+    return f'{kind}dictionary = "{layout.dictionary}", squares = [{layout.squares[0]}, {layout.squares[1]}]{legacy}'
 
 
 def outside_frame(camera: Camera, pose: np.ndarray, board: dict[str, Any]) -> float:
@@ -155,7 +163,7 @@ def outside_frame(camera: Camera, pose: np.ndarray, board: dict[str, Any]) -> fl
 def cut(camera: Camera, pose: np.ndarray, board: dict[str, Any], corners: int) -> str:
     """What to say of a board that reaches out of the frame; empty when the frame holds it."""
     outside = outside_frame(camera, pose, board)
-    total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
+    total = points_on(board)
     if outside <= CUT:
         return ""
     return (

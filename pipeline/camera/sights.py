@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera.board_kinds import points_on, sightings_of, turns_alike
 from pipeline.camera.markers import fit_marker, marker_points, tone
-from pipeline.camera.opencv_bridge import Sightings, board_sightings, marker_pattern, markers_px
+from pipeline.camera.opencv_bridge import Sightings, marker_pattern, markers_px
 from pipeline.camera.sfm import Seen
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera
@@ -31,11 +32,11 @@ def eight_bit(toned: np.ndarray) -> np.ndarray:
 
 def sighted_board(radiance: np.ndarray, board: dict[str, Any], camera: Camera) -> Sightings:
     """Corners of the board in linear radiance (H, W), through the tone curve that shows more of them."""
-    total = (board["squares"][0] - 1) * (board["squares"][1] - 1)
+    total = points_on(board)
     tries = []
     for curve in CURVES:
         toned = tone(radiance, curve)
-        tries.append(board_sightings(eight_bit(toned), toned, board, camera))
+        tries.append(sightings_of(eight_bit(toned), toned, board, camera))
         if len(tries[-1].px) >= ENOUGH_OF_BOARD * total:
             break
     return max(tries, key=lambda seen: len(seen.px))
@@ -76,11 +77,11 @@ def sighted_marker(radiance: np.ndarray, marker: dict[str, Any], camera: Camera,
 
 def marks_in(facts: dict[str, Any], radiance: np.ndarray, camera: Camera) -> tuple[list[Seen], list[str]]:
     """The board, or the markers, in linear radiance (H, W), and why some that are seen are left out."""
-    if facts.get("board"):
+    if facts.get("board") and not turns_alike(facts["board"]):
         sights = sighted_board(radiance, facts["board"], camera)
         return ([Seen(0, sights.world_m, sights.px)] if len(sights.px) >= FEWEST_CORNERS else []), []
     found, notes, look = [], [], looked_at(radiance)
-    for number, marker in enumerate(facts["marker"]):
+    for number, marker in enumerate(facts.get("marker") or []):
         try:
             sights = sighted_marker(radiance, marker, camera, look)
         except CaptureError as error:

@@ -6,7 +6,7 @@ The ids of a printed layout's markers are its own, so a photograph tells which l
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -20,20 +20,40 @@ LAYOUTS: dict[str, dict[str, Any]] = {
                       "marker_m": 0.021, "margin_m": 0.012},
 }  # fmt: skip
 MEASURED = {"layout", "square_m", "margin_m"}  # what may stand beside a layout's name
+FEWEST_SQUARES = 4  # each way, of a chessboard
+SMALLEST_MARKER_M = 0.0005
 FARTHEST_SCALE = 1.5  # of a print: beyond it the measured number is a slip
 
 
 class BoardFacts(Strict):
-    """The printed ChArUco board that defines the world."""
+    """The printed board that defines the world. A grid's square is the pitch of its markers."""
 
+    kind: Literal["charuco", "grid", "chessboard"] = Field(
+        "charuco", description="grid: of ArUco markers or AprilTags, ids row by row; a chessboard has no markers"
+    )
     layout: str | None = Field(None, description=f"{' or '.join(LAYOUTS)}, as insitu board prints it; says the rest")
     dictionary: str = "DICT_5X5_100"
     first_id: int = Field(0, ge=0, description="of its markers")
     squares: tuple[int, int] = Field(description="along x, along y")
     square_m: float = Field(gt=0.001, lt=1.0, description="beside a layout: as measured on the print")
-    marker_m: float = Field(gt=0.0005, lt=1.0)
+    marker_m: float = Field(0.0, ge=0, lt=1.0, description="side of a marker; none on a chessboard")
     margin_m: float = Field(0.0, ge=0, description="white paper around the print")
     legacy: bool = False
+
+    @model_validator(mode="after")
+    def _of_its_kind(self) -> BoardFacts:
+        if self.kind == "chessboard" and (self.marker_m or self.first_id or self.legacy):
+            raise ValueError("kind is 'chessboard', which has no marker_m, first_id or legacy; take them out")
+        if self.kind == "chessboard" and min(self.squares) < FEWEST_SQUARES:
+            raise ValueError(f"squares is {list(self.squares)}; a chessboard needs {FEWEST_SQUARES} or more each way")
+        if self.kind != "chessboard" and not SMALLEST_MARKER_M < self.marker_m < self.square_m:
+            raise ValueError(
+                f"marker_m is {self.marker_m:g}; expected the side of a marker, above {SMALLEST_MARKER_M:g} and below "
+                f"square_m = {self.square_m:g}"
+            )
+        if self.kind == "grid" and self.legacy:
+            raise ValueError("legacy is for kind 'charuco'; take it out")
+        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -50,7 +70,7 @@ class BoardFacts(Strict):
             raise ValueError(
                 f"square_m is {square_m:g}; layout {value['layout']} prints {known['square_m']:g}; measure one square"
             )
-        whole = {**known, "legacy": False, "marker_m": known["marker_m"] * scale}
+        whole = {**known, "kind": "charuco", "legacy": False, "marker_m": known["marker_m"] * scale}
         said = [key for key in value if key not in MEASURED and not _same(value[key], whole.get(key))]
         if said:
             raise ValueError(f"layout {value['layout']} does not have this {said[0]}; expected only square_m beside it")
