@@ -4,23 +4,26 @@
 
 The truth of the bundled CAPTURE that SCENE.toml made (plate, plate with objects, coverage) is brought to half its size,
 2 x 2 pixels to one, which leaves it less noise than it had; ball views and board photographs are rendered at that size.
-All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern,
-hot photosites, JPEG noise of the board photographs (so corners, lens and pose of its own) and shutter: each setting of
-the dial is off by `DIAL`, each frame by `FRAME` more. Truth is the same for all and is linked to.
+All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern, hot photosites, JPEG
+noise of the board photographs, corners (so lens and pose of its own) and shutter: each setting of the dial is off by
+`DIAL`, each frame by `FRAME` more. Its cameras are turned by up to half a pixel, so that lamps and edges fall otherwise
+on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`).
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.camera.rigid import rotation_exp
 from pipeline.run.cli import say
 from pipeline.run.formats import read_exr, write_bytes
 from pipeline.simulation import capture, shapes
-from pipeline.simulation.lens import blur
+from pipeline.simulation.lens import Lens, blur, look_at
 from pipeline.simulation.scene_file import SimulatedScene, load_scene
 from pipeline.simulation.world import Place
 from pipeline.transport.variant import use_mitsuba
@@ -28,8 +31,10 @@ from stages import simulate
 
 HALF = 2  # pixels of the bundled truth along a side that become one
 SAMPLING = {"ball": 64, "calibration": 32, "environment": 64, "environment_width": 256}
-SOFT_PX = 0.4  # Gaussian on the halved truth: 0.37 px are its own, together 0.55 as the simulated lens has it
+BLUR_PX = 0.76  # of the lens: at 0.55 lamps, 2 px small in the ball, alias on the mosaic by 3 % of their colour
+SOFT_PX = 0.66  # Gaussian on the halved truth: 0.37 px are its own, together `BLUR_PX`
 DIAL = 0.01  # of log time, of each setting of the shutter; real ones are off by up to several percent
+CORNER_PX = 0.1  # of each corner, as the pose stage takes its own at the full size
 FRAME = 0.002  # of log time, of each frame: what one setting repeats to
 
 
@@ -61,6 +66,7 @@ def reduced(scene: SimulatedScene) -> SimulatedScene:
     smaller = camera.model_copy(
         update={n: getattr(camera, n) / HALF for n in ("fx", "fy", "cx", "cy")}
         | {n: getattr(camera, n) // HALF for n in ("width", "height")}
+        | {"blur_sigma_px": BLUR_PX}
     )
     sampling = scene.sampling.model_copy(update=SAMPLING)
     return scene.model_copy(update={"camera": smaller, "sampling": sampling})
@@ -132,17 +138,88 @@ class Reshoot(capture.Shoot):
         self.now = 1.0
 
 
+def turns(scene: SimulatedScene) -> dict[str, np.ndarray]:
+    """Rotation (3, 3) of each view's camera against the scene file's: views on the tripod share the plate's."""
+    random = np.random.default_rng([scene.seed, 7])
+    found: dict[str, np.ndarray] = {}
+    for view in [scene.plate, *scene.ball_view]:
+        angles = random.uniform(-0.5, 0.5, 2) / (scene.camera.fx, scene.camera.fy)
+        alone = view is scene.plate or view.position_m is not None
+        found[view.name] = rotation_exp(np.array([*angles, 0.0])) if alone else found[scene.plate.name]
+    return found
+
+
+def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """A picture (H, W, C) as the camera sees it when it is turned by ``turn`` (3, 3) in its own frame."""
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = np.mgrid[: lens.height, : lens.width] + 0.5
+    rays = np.stack([*lens.ideal_from_pixel(columns, rows), np.ones(rows.shape)], -1)
+    x, y = (lens.project((rays @ turn.T).reshape(-1, 3)) - 0.5).T
+    channels = [map_coordinates(channel, [y, x], order=5, mode="nearest") for channel in np.moveaxis(values, -1, 0)]
+    return np.stack(channels, -1).reshape(values.shape)
+
+
+def write_truth_of(scene: SimulatedScene, shared: Path, out: Path, turned: dict[str, np.ndarray]) -> None:
+    """The truth of a capture whose cameras are turned; pictures of the plate's camera are resampled."""
+    lens, turn = capture.lens_of(scene.camera), turned[scene.plate.name]
+    record = json.loads((shared / "truth.json").read_text())
+    for name, view in record["views"].items():
+        pose = np.array(view["world_from_camera"])
+        pose[:3, :3] = pose[:3, :3] @ turned[name]
+        view["world_from_camera"] = pose.tolist()
+    capture.write_truth(out / "truth.json", record)
+    for name in ("plate", "with_objects"):
+        rgb = read_exr(shared / f"{name}.exr").rgb().astype(float)
+        capture.write_picture(out / f"{name}.exr", seen_turned(lens, rgb, turn))
+    layers = read_exr(shared / "coverage.exr").channels
+    moved = {n: np.clip(seen_turned(lens, v[..., None].astype(float), turn)[..., 0], 0, 1) for n, v in layers.items()}
+    capture.write_layers(out / "coverage.exr", moved, (lens.height, lens.width))
+    for name in ("albedo.exr", "environment.exr"):
+        (out / name).symlink_to((shared / name).resolve())
+
+
+def write_poses(scene: SimulatedScene, manifest: Path, turned: dict[str, np.ndarray]) -> None:
+    """Append the board's inner corners as surveyed points of the plate and of ball views that moved.
+
+    At half the size its markers are too small to be read; so corners are where they truly are, off by `CORNER_PX`.
+    """
+    board, lens = scene.board, capture.lens_of(scene.camera)
+    assert board is not None
+    across, down = board.squares
+    x, z = (axis.ravel() * board.square_m for axis in np.meshgrid(np.arange(1, across), np.arange(1, down)))
+    world = np.stack([x, 0 * x, z], -1)
+    lines = []
+    for number, view in enumerate([scene.plate, *(v for v in scene.ball_view if v.position_m is not None)]):
+        pose = look_at(
+            np.array(view.position_m or scene.plate.position_m), np.array(view.target_m or scene.plate.target_m)
+        )
+        px = lens.project((world - pose[:3, 3]) @ pose[:3, :3] @ turned[view.name])
+        px += CORNER_PX * np.random.default_rng([scene.seed, 6, number]).standard_normal(px.shape)
+        points = ", ".join(
+            f"{{ world_m = {w.tolist()}, px = {p.round(4).tolist()}, sigma_m = 1e-5, sigma_px = {CORNER_PX} }}"
+            for w, p in zip(world, px, strict=True)
+        )
+        lines += ["", "[[pose]]", f'view = "{view.name}"', 'route = "points"', f"points = [{points}]"]
+    with manifest.open("a") as file:
+        file.write("\n".join(lines) + "\n")
+
+
 def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: Path, out: Path) -> None:
-    """Write capture ``number`` into ``out``; truth and objects are links to those in ``shared``."""
+    """Write capture ``number`` into ``out``; objects are a link to those in ``shared``."""
     scene = scene.model_copy(update={"seed": scene.seed + 1000 * (number + 1)})
     out.mkdir(parents=True)
-    for part in ("truth", "objects"):
-        (out / part).symlink_to((shared / part).resolve())
+    (out / "objects").symlink_to((shared / "objects").resolve())
+    turned, lens = turns(scene), capture.lens_of(scene.camera)
     shoot = Reshoot(scene, out, capture.sensor_of(scene))
     capture.write_manifests(scene, out)
-    capture.take_brackets(shoot, {**pictures.balls, "plate": pictures.plate})
+    write_poses(scene, out / "capture.toml", turned)
+    shots = {**pictures.balls, "plate": pictures.plate}
+    capture.take_brackets(shoot, {name: seen_turned(lens, shot, turned[name]) for name, shot in shots.items()})
     for board, picture in enumerate(pictures.boards):
         write_bytes(out / "calibration" / f"calib_{board:02d}.jpg", capture.srgb_jpeg(picture, shoot.sensor, board))
+    (out / "truth").mkdir()
+    write_truth_of(scene, shared / "truth", out / "truth", turned)
 
 
 def place_of(scene_toml: Path, bundled: Path, folder: Path) -> tuple[SimulatedScene, Pictures]:

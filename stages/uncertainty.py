@@ -95,7 +95,10 @@ def compute(
     return Result(outputs, numbers, warnings, evidence)
 
 
-SIGMA = "sigma^2 = plate^2 + render^2 + sum(mode^2); modes are signed, independent of each other, one sigma each"
+SIGMA = (
+    "sigma^2 = plate^2 + render^2 + sum(mode^2); modes are signed, independent of each other, one sigma each; channels "
+    "of flux and sky modes are independent too"
+)
 
 
 class Studio:

@@ -93,6 +93,17 @@ def test_flux_pattern_is_the_emitters_sigma():
     assert irradiance(pattern.radiance, lamp.direction[None])[0] == pytest.approx(0.8 * lamp.irradiance_sigma, rel=1e-6)
 
 
+def test_texels_of_a_small_lamp_err_together():
+    """A lamp within one cell of the comparison of views: its flux is as unsure as a texel, not less by their number."""
+    rgb = np.full((256, 512, 3), 0.1)
+    rgb[100:104, :4] = 50.0
+    texels = np.flatnonzero(rgb[..., 0].ravel() > 1)
+    lamp = lamp_of(sky(), 0.01).model_copy(update={"texels": texels})
+    (pattern,) = light.flux_patterns(environment(rgb, 0.1 * rgb), [lamp], np.zeros(3))
+    assert pattern.radiance.reshape(-1, 3)[texels] == pytest.approx(np.full((16, 3), 0.1 * 50.0))
+    assert np.count_nonzero(pattern.radiance) == 48
+
+
 def test_a_turned_map_is_the_light_from_elsewhere():
     rgb, turn = sky(), np.array([0.05, -0.1, 0.03])
     moved = light.turned(rgb, turn)

@@ -80,19 +80,34 @@ def own_sigma(environment: Raster, shared: np.ndarray) -> np.ndarray:
 
 
 def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
-    """One pattern per emitter: all its texels by the relative sigma of its irradiance, less what all light shares."""
-    rgb, found = environment.rgb().astype(float), []
+    """One pattern per emitter: all its texels by the relative sigma of its flux, less what all light shares.
+
+    A lamp is a few pixels of the ball: how they sample it errs for all its texels together, and for each colour of the
+    mosaic by itself. So texels count as alike within `ALIKE_DEG`, as views disagree, unless its stated sigma is larger.
+    """
+    rgb, sigma, found = environment.rgb().astype(float), own_sigma(environment, shared), []
+    height, width = environment.shape
+    directions, weight = latlong_directions(height, width), latlong_solid_angles(height, width)[..., None]
     for emitter in emitters:
-        texels = np.asarray(emitter.texels, int)
-        relative = np.divide(
+        inside = np.zeros((height, width, 1), bool)
+        inside.reshape(-1)[np.asarray(emitter.texels, int)] = True
+        stated = np.divide(
             emitter.irradiance_sigma, emitter.irradiance, out=np.zeros(3), where=np.asarray(emitter.irradiance) > 0
         )
-        if emitter.evidence != "measured":  # there the texels' shared part was added, not squared, so it is in
-            relative = np.sqrt(np.maximum(relative**2 - shared**2, 0))
-        added = np.zeros_like(rgb)
-        added.reshape(-1, 3)[texels] = rgb.reshape(-1, 3)[texels] * relative
-        found.append(_radiance(f"flux_{emitter.name}", "flux", added, rgb, emitter))
+        if emitter.evidence == "measured":
+            cells = _cells(np.where(inside, weight * sigma, 0), directions[..., 1], _rows(height))
+            flux = np.where(inside, weight * rgb, 0).sum((0, 1))
+            alike = np.divide(np.sqrt((cells**2).sum(0)), flux, out=np.zeros(3), where=flux > 0)
+            relative = np.maximum(stated, alike)
+        else:  # recovered: the texels' shared part was added, not squared, so it is in
+            relative = np.sqrt(np.maximum(stated**2 - shared**2, 0))
+        found.append(_radiance(f"flux_{emitter.name}", "flux", np.where(inside, rgb, 0) * relative, rgb, emitter))
     return found
+
+
+def _rows(height: int) -> int:
+    """Rows of a map within which texels err alike."""
+    return max(1, round(height * ALIKE_DEG / 180))
 
 
 def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
@@ -105,7 +120,7 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     seen = environment.channels.get("seen", np.ones((height, width)))
     unseen = np.where((seen < UNSEEN)[..., None], sigma, 0)
     sigma = sigma - unseen
-    rows = max(1, round(height * ALIKE_DEG / 180))
+    rows = _rows(height)
     level = np.maximum(rgb, 0)
     lobes, direct = [], np.zeros(3)
     for axis in AXES:

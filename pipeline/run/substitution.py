@@ -106,6 +106,8 @@ def recompute(build: Build, values: Values, truth: Truth, names: list[str]) -> V
     for stage in build.graph.stages:
         if stage.name == "report":
             break
+        if stage.name == "uncertainty":  # metrics do not ask for it
+            continue
         if any(artifact.name in changed for artifact in stage.inputs.values()):
             inputs = {
                 name: build.records_before(stage) if artifact.kind == "records" else values[artifact.name]
