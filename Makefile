@@ -74,7 +74,7 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
 extremes: $(READY)  ## run every case of tests/extremes/cases.toml, into docs/numerics.md, numerics.json and formulas.json
-	$(VENV)/bin/python -m pytest -m extreme --extremes docs
+	$(VENV)/bin/python -m pytest -m extreme --extremes=docs tests
 
 trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/<capture>/trade (an hour or more)
 	@$(INSITU) trade $(CAPTURE) --out $(OUT)
@@ -82,6 +82,9 @@ trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/
 speed: trade  ## regenerate docs/speed.md and its picture from the trade of CAPTURE
 	@cp $(OUT)/trade/trade.md docs/speed.md && cp $(OUT)/trade/trade.svg docs/trade.svg
 	@mkdir -p docs/trade && cp $(OUT)/trade/presets.json docs/trade/$(notdir $(CAPTURE:/=)).json
+
+bench-ask: $(READY)  ## ask errors and a time of the desk, and say what was reached, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.ask
 
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)

@@ -1,7 +1,7 @@
 """The table of extremes: what `extremes/cases.toml` defines, what tests saw of it, and the page of both.
 
 A test takes the fixture ``saw`` and says what it saw of a case; that it is what was defined is asserted there. Tests
-that take it are marked ``extreme``. With ``--extremes FOLDER`` the session writes numerics.json and numerics.md there.
+that take it are marked ``extreme``. With ``--extremes=FOLDER`` the session writes numerics.json and numerics.md there.
 """
 
 from __future__ import annotations
@@ -71,23 +71,21 @@ def page(rows: Iterable[dict[str, Any]], formulas: Iterable[dict[str, Any]]) -> 
         case = CASES[row["case"]]
         refused = row["defined"] == "refused"
         bound, error = ("-", "-") if refused else (figure(row["bound"]), figure(row["worst_error"]))
-        kept = "" if not case.get("never_refused") else " (1)"
+        kept = " (1)" * bool(case.get("never_refused")) + " (2)" * bool(case.get("added"))
         seen = row["seen"] if row["ok"] else f"**{row['seen']}, not as defined**"
         what = f"*{row['said']}*" if refused and row["said"] else case.get("of", "")
         lines.append(
             f"| `{row['case']}` | {case['case']} | {row['defined']}{kept} | {bound} | {seen} | {error} | "
             f"{what.replace('|', chr(92) + '|')} |"
         )
-    heads = [
-        "| formula | condition number | float32 | float64 | where float32 breaks | what is done |",
-        "|" + "---|" * 6,
-    ]
+    names = ("formula", "condition number", "sweep", "float32", "float64", "float32 breaks at", "what is done")
+    heads = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
     for row in formulas:
         heads.append("| " + " | ".join(row[key] for key in FORMULA_COLUMNS) + " |")
     return text.replace("{cases}", "\n".join(lines)).replace("{formulas}", "\n".join(heads))
 
 
-FORMULA_COLUMNS = ("formula", "condition", "float32", "float64", "breaks", "done")
+FORMULA_COLUMNS = ("formula", "condition", "sweep", "float32", "float64", "breaks", "done")
 
 
 def write(folder: Path, rows: list[dict[str, Any]], formulas: list[dict[str, Any]]) -> None:
