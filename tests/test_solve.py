@@ -11,6 +11,7 @@ import pytest
 import staged
 from command import DESK, command, refused
 
+from benchmarks import ask as benchmark
 from pipeline.run import cli
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build
@@ -299,3 +300,19 @@ def test_an_error_asked_of_the_desk_is_reached(tmp_path):
     assert "asked before" in again.stdout
     assert "pilot:" not in again.stdout
     assert again.stdout.count(" fresh ") >= 12
+
+
+def test_the_benchmark_says_whether_what_is_asked_holds():
+    def run(asked: float, error: float, samples: int, cpu: float) -> dict:
+        reached = {"error": error, "cpu_seconds": cpu, "with_pilot_cpu_seconds": cpu + 15}
+        predicted = {"error": asked, "cpu_seconds": 1.1 * cpu}
+        settings = {"render.samples": samples, "probe.width": 512}
+        told = {"asked": {"max_error": asked}, "settings": settings, "predicted": predicted}
+        return told | {"reached": reached | {"against_truth": {"error": 1.2 * error}}}
+
+    runs = [run(0.01, 0.01, 192, 120.0), run(0.1, 0.06, 2, 20.0)]
+    assert benchmark.line_of(runs[1]) == "| max error 0.1 | 2 | 512 | 0.1000 | 0.0600 | 0.0720 | 22 | 20 | 35 |"
+    words = benchmark.verdict(runs)
+    assert "1.20 at most" in words
+    assert "within 9%" in words
+    assert "2 distinct settings, the dearest 6.0 times" in words

@@ -1,0 +1,83 @@
+"""What ``--max-error`` and ``--time-budget`` reach on a capture with truth: predicted beside reached.
+
+``python -m benchmarks.ask`` runs the bundled desk with each question and writes docs/benchmarks/ask.md; run.json of
+each stays in the build folder. About 300 CPU seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "benchmarks" / "ask.md"
+QUESTIONS = ("--max-error 0.01", "--max-error 0.02", "--max-error 0.05", "--max-error 0.1", "--time-budget 60")
+ALLOWED, TIME = 1.5, 0.25  # the project's: reached over asked, and how far CPU seconds may be from those predicted
+INTRODUCTION = """# An error or a time, asked of the desk
+
+`make bench-ask` runs `insitu run sample_captures/desk` with each question, one after the other in one build folder, so
+that they share a pilot. The error is the larger of `object_rel_err` and `shadow_change_err`; *by its records* is what a
+run says of itself without truth. CPU seconds are of the stages up to the composite; *with the pilot* is what was spent
+from nothing, what the pilot left finished not counted twice. {machine}, {cores} cores, load {load:.1f} at the end.
+
+| asked | samples | map [px] | predicted | by its records | against truth | CPU s predicted | taken | with the pilot |
+|---|---:|---:|---:|---:|---:|---:|---:|---:|
+"""
+
+
+def line_of(told: dict[str, Any]) -> str:
+    """A row of the table, of one run.json."""
+    asked = ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in told["asked"].items())
+    predicted, reached, settings = told["predicted"], told["reached"], told["settings"]
+    errors = (predicted["error"], reached["error"], reached["against_truth"]["error"])
+    seconds = (predicted["cpu_seconds"], reached["cpu_seconds"], reached["with_pilot_cpu_seconds"])
+    cells = [asked, str(settings["render.samples"]), str(settings["probe.width"])]
+    cells += [f"{error:.4f}" for error in errors] + [f"{spent:.0f}" for spent in seconds]
+    return f"| {' | '.join(cells)} |"
+
+
+def verdict(runs: Sequence[dict[str, Any]]) -> str:
+    """Whether what the project asks of these runs holds, one sentence each."""
+    asked = [run for run in runs if "max_error" in run["asked"]]
+    worst = max(run["reached"]["against_truth"]["error"] / run["asked"]["max_error"] for run in asked)
+    apart = max(abs(run["reached"]["cpu_seconds"] / run["predicted"]["cpu_seconds"] - 1) for run in runs)
+    costs = [run["reached"]["cpu_seconds"] for run in asked]
+    distinct = len({json.dumps(run["settings"], sort_keys=True) for run in asked})
+    return (
+        f"Reached over asked, against truth: {worst:.2f} at most (bound {ALLOWED}). CPU seconds are within {apart:.0%} "
+        f"of what was predicted (bound {TIME:.0%}). {distinct} distinct settings, the dearest "
+        f"{max(costs) / min(costs):.1f} times the cheapest (asked: 3, and 4 times).\n"
+    )
+
+
+def page(runs: Sequence[dict[str, Any]]) -> str:
+    """Markdown."""
+    about = {"machine": platform.machine(), "cores": os.cpu_count(), "load": os.getloadavg()[1]}
+    return INTRODUCTION.format(**about) + "\n".join(map(line_of, runs)) + "\n\n" + verdict(runs)
+
+
+def main() -> None:
+    """Run what is asked, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--capture", type=Path, default=ROOT / "sample_captures" / "desk")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "ask")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    args = parser.parse_args()
+    runs = []
+    for question in QUESTIONS:
+        words = [sys.executable, "-m", "stages", "run", str(args.capture), "--out", str(args.out), *question.split()]
+        subprocess.run(words, cwd=ROOT, check=True)
+        runs.append(json.loads((args.out / "run.json").read_bytes()))
+        (args.out / f"run{question.replace(' ', '_')}.json").write_text(json.dumps(runs[-1], indent=1))
+    args.page.write_text(page(runs))
+
+
+if __name__ == "__main__":
+    main()
