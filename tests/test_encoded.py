@@ -19,6 +19,7 @@ from pipeline.image.linearise import linearise
 from pipeline.run.errors import CaptureError
 from pipeline.run.formats import write_exr
 from pipeline.types import Bracket, Frame, Raster
+from stages import knobs, merge
 
 DATA = Path(os.environ.get("INSITU_DATA", Path(__file__).resolve().parents[1] / "../shared/data")).resolve()
 SCENE = (96, 160)
@@ -154,10 +155,10 @@ def light(seed: int = 0) -> np.ndarray:
     return np.kron(patches, np.ones((8, 8, 1)))
 
 
-def bracket(curve, errors: np.ndarray, seed: int = 0) -> list[np.ndarray]:
+def bracket(curve, errors: np.ndarray, seed: int = 0, labels: np.ndarray = LABELS) -> list[np.ndarray]:
     """8-bit codes of a 20 000-electron sensor."""
     rng = np.random.default_rng(seed)
-    counts = [rng.poisson(light(seed) * t * np.exp(e) * 20000) / 20000 for t, e in zip(LABELS, errors)]
+    counts = [rng.poisson(light(seed) * t * np.exp(e) * 20000) / 20000 for t, e in zip(labels, errors)]
     return [np.rint(255 * curve(np.clip(x, 0, 1))).astype(np.uint8) for x in counts]
 
 
@@ -177,9 +178,25 @@ def test_known_curves_are_recovered_within_their_uncertainty(name):
         sigma = np.interp(codes, grid, found.sigma()[:, channel])
         # Measured over three curves and the channels: 0.3 to 1.6 % (OpenCV's Debevec on such brackets: 5 to 9 %).
         assert np.sqrt(np.mean(wrong**2)) < 0.025
-        assert np.sqrt(np.mean((wrong / np.maximum(sigma, 0.003)) ** 2)) < 2.5  # SLOPE_STEP is a prior, not a law
+        assert np.sqrt(np.mean((wrong / np.maximum(sigma, 0.003)) ** 2)) < 1.5  # measured at most 0.8 of what is stated
     # What labels leave open is found: 3 % errors to 1 % (measured 0.1 to 0.6 %).
     assert np.abs((found.offsets - found.offsets.mean()) - (errors - errors.mean())).max() < 0.01
+
+
+def test_few_frames_of_a_picture_style_know_how_little_they_say():
+    """Three frames three stops apart leave most of a sigmoid to the prior: off by 1.5 %, and stated so.
+
+    Measured over nine channels: at most 1.3 times what is stated; with the prior's own smoothness 1.6 times.
+    """
+    labels = 8.0 ** np.arange(-2, 1)
+    x, codes, grid = np.geomspace(1e-6, 1, 20001), np.arange(20, 236) / 255, np.linspace(0, 1, response.TABLE)
+    true = np.log(np.interp(codes, contrasty(x), x))
+    found = response.recover([bracket(contrasty, np.zeros(3), 1, labels)], [labels], 255)
+    for channel in range(3):
+        wrong = np.interp(codes, grid, found.log_light[:, channel]) - true
+        wrong -= wrong[107]
+        sigma = np.interp(codes, grid, found.sigma()[:, channel])
+        assert np.sqrt(np.mean((wrong / np.maximum(sigma, 0.003)) ** 2)) < 1.5
 
 
 def frames_of(count: int) -> list[Frame]:
@@ -216,8 +233,8 @@ def test_one_frame_has_the_priors_curve_and_says_so():
 # Real brackets --------------------------------------------------------------------------------------------------------
 
 
-def real(name: str, every: int = 1) -> tuple[list[Frame], dict[str, np.ndarray]]:
-    """Frames sorted from the shortest, and their codes, cut to a middle strip to be quick."""
+def real(name: str, every: int = 1, largest: int = 192) -> tuple[list[Frame], dict[str, np.ndarray]]:
+    """Frames sorted from the shortest, and their codes, cut to a middle part of ``largest`` px or half to be quick."""
     files = sorted(file for file in (DATA / name).glob("*") if file.suffix in (".jpg", ".png"))[::every]
     if not files:
         pytest.skip(f"INSITU_DATA has no {name}")
@@ -228,7 +245,7 @@ def real(name: str, every: int = 1) -> tuple[list[Frame], dict[str, np.ndarray]]
     codes = {}
     for frame in frames:
         samples = read_samples(DATA / name / frame.file, frame)
-        rows, columns = (slice(size // 4, size // 4 + min(size // 2, 192)) for size in samples.shape[:2])
+        rows, columns = (slice(size // 4, size // 4 + min(size // 2, largest)) for size in samples.shape[:2])
         codes[frame.file] = np.ascontiguousarray(samples[rows, columns])
     return sorted(frames, key=exposure_of), codes
 
@@ -286,14 +303,35 @@ def test_memorial_frames_agree_within_their_noise():
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "every", "largest", "step"),
+    [pytest.param("brackets_memorial", 1, 384, 1, marks=pytest.mark.slow), ("brackets_corridor", 2, 192, 2 / 3)],
+)
+def test_real_brackets_go_through_the_whole_merge(name, every, largest, step):
+    """Sixteen frames of film; twelve of a hand-held corridor. Nothing is lost, steps are found, motion is said."""
+    frames, codes = real(name, every, largest)
+    linear = linearise({"plate": Bracket(name="plate", role="plate", frames=frames)}, lambda f: codes[f.file])
+    decode = lambda f: merge.Decoded(linear.samples(f, codes[f.file]))  # noqa: E731
+    result = linear.completed(merge.merge_brackets(linear.brackets, decode, knobs.Merge()))
+    raster, numbers = result.outputs["mosaics"]["plate"], result.numbers["views"]["plate"]
+    assert numbers["frames"] == len(frames)
+    assert np.isfinite(raster.rgb("variance")).all()  # what clips in the longest is seen in the shortest
+    assert (raster.rgb() > 0).mean() > 0.97
+    found = np.diff(np.log2([row["estimated_s"] for row in result.outputs["exposures"]["plate"]]))
+    # Measured on whole pictures of film: 0.93 to 1.15 stops.
+    assert np.abs(found / step - 1).max() < 0.2
+    # Measured on the whole pictures of film 16 %, on the corridor, which no tripod held, 13 %. It is said.
+    assert numbers["ghost_fraction"] < 0.25
+    assert any("frames disagree" in text for text in result.warnings)
+    assert numbers["median_snr"] > 30
+
+
 def test_dark_rack_is_read():
     measured, labelled = steps(*real("brackets_servers"))
     assert np.abs(measured - labelled).max() < 0.25  # nearly all of it is dark; measured 0.19 on this crop
 
 
 def test_misaligned_frames_are_refused_with_their_shift():
-    from stages import knobs, merge
-
     frames, codes = real("brackets_misaligned_d800")
     assert len(frames) == 6
     assert np.all(np.diff([exposure_of(frame) for frame in frames]) >= 0)

@@ -110,10 +110,13 @@ def recover(views: Sequence[Sequence[np.ndarray]], labels: Sequence[Sequence[flo
     sigma = [np.full(len(b.code), 0.5 / 255) for b in blocks]
     slopes, offsets = np.ones((3, _size())), np.zeros(len(logs))
     for _ in range(ROUNDS):
-        slopes, offsets, covariance = _step(blocks, sigma, weight, logs, errors, slopes, offsets)
+        slopes, offsets, _ = _step(blocks, sigma, weight, logs, errors, slopes, offsets, SLOPE_STEP)
         pulls = [_pulls(b, k, s, w, logs + offsets) for b, k, s, w in zip(blocks, slopes, sigma, weight)]
         sigma = [_rescaled(b, s, pull) for b, s, pull in zip(blocks, sigma, pulls)]
         weight = [np.clip(1 - (pull / (1.5 * ROBUST)) ** 2, 0, None) ** 2 for pull in pulls]
+    # The fit holds slopes together by what curves do as a rule; how unsure it is follows from what this one does.
+    bend = max(SLOPE_STEP, float(np.sqrt((np.diff(slopes, axis=1) ** 2).mean())))
+    covariance = _step(blocks, sigma, weight, logs, errors, slopes, offsets, bend)[2]
     design = _design(_grid())
     basis = design - design[TABLE // 2]
     curve = basis @ slopes.T
@@ -258,7 +261,7 @@ def _across(ladder: np.ndarray) -> np.ndarray:
 
 def _step(
     blocks: list[_Blocks], sigma: list[np.ndarray], weight: list[np.ndarray], logs: np.ndarray, errors: np.ndarray,
-    slopes: np.ndarray, offsets: np.ndarray,
+    slopes: np.ndarray, offsets: np.ndarray, bend: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One bounded Gauss-Newton step, shortened until the cost falls, on ``sum (misfit / (sigma d ln L / dz))^2``.
 
@@ -270,7 +273,7 @@ def _step(
     size, count = _size(), errors.shape[1]
     total = 3 * size + count
     start = np.concatenate([slopes.ravel(), errors.T @ offsets])
-    prior, wanted = _prior(errors)
+    prior, wanted = _prior(errors, bend)
     normal, right = prior.copy(), wanted.copy()
     for channel, (b, s, w) in enumerate(zip(blocks, sigma, weight)):
         design, steepness = _design(b.code), _steepness(b.code, slopes[channel])
@@ -305,12 +308,14 @@ def _step(
     return found[: 3 * size].reshape(3, size), errors @ found[3 * size :], np.stack([covariance[p, p] for p in parts])
 
 
-def _prior(errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normal matrix and right side of what is known beforehand of slopes and offsets."""
+def _prior(errors: np.ndarray, bend: float) -> tuple[np.ndarray, np.ndarray]:
+    """Normal matrix and right side of what is known beforehand of offsets, and of slopes that ``bend`` so from knot to
+    knot.
+    """
     size = _size()
     total = 3 * size + errors.shape[1]
     normal, right = np.zeros((total, total)), np.zeros(total)
-    steps = np.diff(np.eye(size), axis=0) / SLOPE_STEP
+    steps = np.diff(np.eye(size), axis=0) / bend
     for channel in range(3):
         part = slice(channel * size, (channel + 1) * size)
         normal[part, part] = steps.T @ steps + np.eye(size) / (size * SLOPE_SPREAD**2)
