@@ -104,6 +104,33 @@ def points(record: dict[str, Any], name: str) -> list[str]:
     return lines
 
 
+def bias(record: dict[str, Any]) -> list[str]:
+    """What the test for bias found, in words."""
+    found = record.get("zscore")
+    if not found:
+        return ["Largest z of a tile's mean against the reference strategy: " + number(record["zscore_max"]) + "."]
+    light = found["light_traced"]
+    lines = [
+        "",
+        f"`python -m benchmarks.zscore` ({found['cpu_s']:.0f} CPU s): the fast strategy against two full path-traced "
+        f"renders on {found['number_of_scenes']} random scenes, tiles of 8 x 8 pixels, three channels of change and "
+        f"three of objects. Largest z {found['zscore_max']:.2f} (limit 5), mean square "
+        f"{found['zscore_square_mean']:.2f} of {found['tile_channels_tested']}; "
+        f"{found['tile_channels_changed']} of the change are over 1 % of LS_noobj, and in "
+        f"{found['oracle_reached_changed']:.0%} of these the oracle's standard error is at most 1 % of the change "
+        f"(largest {found['oracle_rel_error_max']:.1%}). A bias of {found['smallest_detectable_bias_rel']:.1%} "
+        f"of the change would be seen in the median tile, of {found['smallest_detectable_bias_rel_p90']:.1%} in nine "
+        f"of ten, and of {found['smallest_detectable_common_bias_rel']:.2%} if all share it; found: "
+        f"{found['common_bias_rel']:+.2%}.",
+    ]
+    if light:
+        lines.append(
+            f"With light tracing, on the {light['number_of_scenes']} scenes with a compact light: largest z "
+            f"{light['zscore_max']:.2f}, mean square {light['zscore_square_mean']:.2f}."
+        )
+    return lines
+
+
 def write_page(record: dict[str, Any], folder: Path) -> None:
     """render.md and its picture, render.svg."""
     curves(record, folder / "render.svg")
@@ -122,21 +149,28 @@ def write_page(record: dict[str, Any], folder: Path) -> None:
         *table(record),
         "",
     ]
+    if "seconds" in record:
+        each = ", ".join(f"{name} {part['wall_s']:.0f}" for name, part in record["seconds"].items())
+        lines += [f"Measured in {record['wall_s']:.0f} s: {each}.", ""]
     if record.get("remark"):
         lines += [record["remark"], ""]
     if not peers:
         lines += ["Cycles was left out: `make bench-cycles-env` installs it in an environment of its own.", ""]
     if "preview_cpu_s" in record:
+        cold = record.get("preview_cold_cpu_s")
         lines.append(
             f"First complete composite of diffuse_glossy from a loaded scene, knobs of draft: "
-            f"{record['preview_cpu_s']:.1f} CPU s, RMSE {record['preview_rmse_255']:.2f} / 255; with nothing compiled "
-            f"yet {record['preview_cold_cpu_s']:.1f} CPU s."
+            f"{record['preview_cpu_s']:.1f} CPU s, RMSE {record['preview_rmse_255']:.2f} / 255"
+            + (f"; with nothing compiled yet {cold:.1f} CPU s." if cold is not None else ".")
         )
-    tiny = record["tiny"]
+    if "tiny" in record:
+        tiny = record["tiny"]
+        lines.append(
+            "The render stage on 24 Mpx over that on a crop of 1 Mpx, same object: "
+            f"{record['tiny_24mpx_over_1mpx']:.2f} ({tiny['large_cpu_s']:.1f} and {tiny['small_cpu_s']:.1f} CPU s)."
+        )
     lines += [
-        f"The render stage on 24 Mpx over that on a crop of 1 Mpx, same object: {record['tiny_24mpx_over_1mpx']:.2f} "
-        f"({tiny['large_cpu_s']:.1f} and {tiny['small_cpu_s']:.1f} CPU s).",
-        "Largest z of a tile's mean against the reference strategy: " + number(record["zscore_max"]) + ".",
+        *bias(record),
         "",
         METHOD.format(naive_depth=8, version=version),
         "## Scenes",

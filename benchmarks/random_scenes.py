@@ -1,9 +1,9 @@
 """Random small scenes for tests of bias: every kind of local scene, light and material, from a seed.
 
-A frame of 48 x 32 pixels shows about ten metres: a plane alone, with boxes that see each other, between walls,
-glossy, or glossy with boxes; one to three objects out of every material; a sky with none to two lamps, which half of
-the time are told apart as emitters. Lamps are discs of 4 to 8 degrees: smaller ones would need another order of samples
-behind glass, for the reference finds them there by chance alone.
+A frame of 24 x 16 pixels, 6 tiles, shows about ten metres: a plane alone, with boxes that see each other, between
+walls, glossy, or glossy with boxes; one to three objects out of every material; a sky with none to two lamps, which
+half of the time are told apart as emitters. Lamps are discs of 4 to 8 degrees: smaller ones would need another order of
+samples behind glass, for the reference finds them there by chance alone.
 
 Objects are a metre and more in size, for Mitsuba lifts the start of a ray 9e-5 (1 + max |p|) off its surface, as if the
 plane were that much higher. At 0.1 m that is a bias of the reference of 0.1 % of the light beside an object (measured;
@@ -17,11 +17,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.scenes import Shape, ball, box, column, floor, looking, pinhole
-from pipeline.camera.lens import ray_grid
-from pipeline.conventions import direction_from_latlong, latlong_directions, latlong_solid_angles
+from pipeline.camera.lens import project, ray_grid
+from pipeline.conventions import (
+    direction_from_latlong,
+    invert_rigid,
+    latlong_directions,
+    latlong_solid_angles,
+    transform_points,
+)
 from pipeline.light.emitters import lights
 from pipeline.light.environment import irradiance, total_energy
 from pipeline.transport import proxies
+from pipeline.transport.caustics import Film
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import object_shape
@@ -40,7 +47,7 @@ MATERIALS = {
     "emissive": Material((0.3, 0.3, 0.3), 0.0, 0.8, emission=(2.0, 1.4, 0.8)),
 }
 MAP = (64, 128)
-SIZE = (32, 48)  # rows, columns
+SIZE = (16, 24)  # rows, columns
 LIFT = 0.02  # m: flat undersides do not lie in the plane, where either could be hit first
 EXTENT_M = 30.0
 TARGET = (1.0, 0.3, 0.4)  # between the middle and the first object
@@ -49,13 +56,14 @@ UP = np.array([[0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A scene ready to trace, what it is made of, and its plane's irradiance (3,)."""
+    """A scene ready to trace, what it is made of, its plane's irradiance (3,), and the lens, for light tracing."""
 
     name: str
     worlds: Worlds
     rays: Rays
     shape: tuple[int, int]
     light: np.ndarray
+    film: Film
 
 
 def random_case(seed: int, shape: tuple[int, int] = SIZE, fov_deg: float = 42.0) -> Case:
@@ -88,11 +96,16 @@ def random_case(seed: int, shape: tuple[int, int] = SIZE, fov_deg: float = 42.0)
     worlds = build_worlds(ground(), albedo, environment, shapes, random_proxies(random, kind), emitters, gloss)
     azimuth = random.uniform(0.1, 1.4) if kind == "walls" else random.uniform(0, 2 * np.pi)
     eye = 9.0 * np.array([np.sin(azimuth), random.uniform(0.7, 1.2), np.cos(azimuth)])
-    xn, dxn = ray_grid(pinhole(shape[1], shape[0], fov_deg))
-    pose = looking(tuple(eye), TARGET)
+    camera, pose = pinhole(shape[1], shape[0], fov_deg), looking(tuple(eye), TARGET)
+    xn, dxn = ray_grid(camera)
     rays = Rays.of(pose, xn.reshape(-1, 2), dxn.reshape(-1, 2, 2))
+    camera_from_world = invert_rigid(pose)
+    film = Film(
+        lambda points: project(camera, transform_points(camera_from_world, points)), shape,
+        lambda pixels: rays[pixels].solid_angles(), pose[:3, 3],
+    )  # fmt: skip
     lit = f"{lamps} lamps" + (f", {len(emitters)} apart" if emitters else "")
-    return Case(f"{kind}: {', '.join(chosen)}; {lit}", worlds, rays, shape, light)
+    return Case(f"{kind}: {', '.join(chosen)}; {lit}", worlds, rays, shape, light, film)
 
 
 def ground() -> Plane:

@@ -1,19 +1,22 @@
 """How fast the render is at equal error: ``make bench-render`` writes docs/benchmarks/render.json and render.md.
 
-    python -m benchmarks.render [--full] [--size 1280x720] [--scenes diffuse_glossy,...] [--out docs/benchmarks]
+    python -m benchmarks.render [--full] [--size 1280x720] [--parts diffuse_glossy,...] [--resume] [--out FOLDER]
 
-Replicates of the strategies take turns, so that whatever else the machine does burdens all alike.
+Replicates of the strategies take turns, so that whatever else the machine does burdens all alike. Every part is kept
+in ``build/bench_render`` as soon as it is measured: ``--resume`` goes on where a run was broken off. The test for bias
+is a command of its own, `benchmarks.zscore`; its figures in render.json are kept.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import functools
 import json
 import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,7 @@ from stages.knobs import Render
 NAIVE_DEPTH = 8
 LATTICE = 3  # every third pixel in both directions: an error needs no more, a reference costs a ninth
 TILE = 8  # chosen pixels, of the comparison of means
+KEPT = Path("build/bench_render")
 
 
 @dataclass(frozen=True)
@@ -159,11 +163,42 @@ def cycles_facts(
     }
 
 
-def zscore() -> float | None:
-    """Largest z of tile means of the difference against the oracle; None while that benchmark is not there."""
-    if importlib.util.find_spec("benchmarks.zscore") is None:
-        return None
-    return float(importlib.import_module("benchmarks.zscore").run()["zscore_max"])
+def parts(width: int, height: int, budget: Budget, threads: int, say: Any) -> dict[str, Callable[[], dict[str, Any]]]:
+    """What there is to measure, by name; each gives its rows of render.json."""
+
+    def scene(name: str) -> dict[str, Any]:
+        found = measure(SCENES[name](width, height), budget, threads, say)
+        first = found.pop("preview", None)
+        rows = {} if first is None else {
+            "preview_cpu_s": first["cpu_s"], "preview_rmse_255": max(first["error"], 0.0) ** 0.5
+        }  # fmt: skip
+        return {name: found} | rows
+
+    def tiny() -> dict[str, Any]:
+        ratio, costs = tiny_ratio(budget.replicates)
+        say(f"24 over 1 Mpx: {ratio:.2f}")
+        return {"tiny_24mpx_over_1mpx": ratio, "tiny": costs}
+
+    def preview_cold() -> dict[str, Any]:
+        return {"preview_cold_cpu_s": preview.cold(width, height)}
+
+    scenes = {name: functools.partial(scene, name) for name in SCENES}
+    return {**scenes, "tiny": tiny, "preview_cold": preview_cold}
+
+
+def measured(name: str, part: Callable[[], dict[str, Any]], asked: dict[str, Any], resume: bool) -> dict[str, Any]:
+    """The rows of a part, its seconds with them: those kept of a run that was broken off, or measured now."""
+    file = KEPT / f"{name}.json"
+    if resume and file.exists():
+        kept: dict[str, Any] = json.loads(file.read_text())
+        if kept["asked"] == asked:
+            return kept
+    with cpu_seconds() as timer:
+        rows = part()
+    kept = {"asked": asked, "rows": rows, "wall_s": timer.wall, "cpu_s": timer.seconds}
+    KEPT.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(kept, indent=1) + "\n")
+    return kept
 
 
 def main() -> None:
@@ -172,8 +207,9 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="more samples and replicates (an hour)")
     parser.add_argument("--size", default="1280x720", help="of the pictures [px]")
     parser.add_argument(
-        "--scenes", default=",".join(SCENES), help="which, with commas; the others are kept as they were"
+        "--parts", help="which, with commas: scenes, tiny, preview_cold; the others are kept as they were"
     )
+    parser.add_argument("--resume", action="store_true", help="keep the parts that a run of the same settings measured")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder")
     given = parser.parse_args()
     width, height = (int(v) for v in given.size.split("x"))
@@ -186,24 +222,23 @@ def main() -> None:
 
     if not cycles.available():
         say("Cycles is left out: no .blender environment; `make bench-cycles-env` makes it")
-    record: dict[str, Any] = {}
-    if given.scenes != ",".join(SCENES) and (given.out / "render.json").exists():
-        record = json.loads((given.out / "render.json").read_text())
     given.out.mkdir(parents=True, exist_ok=True)
-    for name in given.scenes.split(","):
-        record[name] = measure(SCENES[name](width, height), budget, threads, say)
-        (given.out / "render.json").write_text(json.dumps(record, indent=1) + "\n")
-    if "tiny" not in record:
-        record["tiny_24mpx_over_1mpx"], record["tiny"] = tiny_ratio(budget.replicates)
-        say(f"24 over 1 Mpx: {record['tiny_24mpx_over_1mpx']:.2f}")
-    if "preview" in record.get("diffuse_glossy", {}):
-        first = record["diffuse_glossy"].pop("preview")
-        record["preview_cpu_s"], record["preview_rmse_255"] = first["cpu_s"], max(first["error"], 0.0) ** 0.5
-        record["preview_cold_cpu_s"] = preview.cold(width, height)
-    if record.get("zscore_max") is None:
-        record["zscore_max"] = zscore()
-    record["size"], record["threads"], record["wall_s"] = [width, height], threads, time.time() - started
-    (given.out / "render.json").write_text(json.dumps(record, indent=1) + "\n")
+    file = given.out / "render.json"
+    old: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    every = parts(width, height, budget, threads, say)
+    wanted = given.parts.split(",") if given.parts else list(every)
+    kept_rows = ("zscore_max", "zscore") if set(wanted) == set(every) else tuple(old)
+    record: dict[str, Any] = {"zscore_max": None} | {name: old[name] for name in kept_rows if name in old}
+    asked = {"size": [width, height], "budget": asdict(budget) | {"full": given.full}, "threads": threads}
+    seconds = dict(record.get("seconds", {}))
+    for name in wanted:
+        found = measured(name, every[name], json.loads(json.dumps(asked)), given.resume)
+        record |= found["rows"]
+        seconds[name] = {"wall_s": found["wall_s"], "cpu_s": found["cpu_s"]}
+        say(f"{name}: {found['wall_s']:.0f} s, {found['cpu_s']:.0f} CPU s")
+    wall = sum(part["wall_s"] for part in seconds.values())
+    record |= {"size": [width, height], "threads": threads, "seconds": seconds, "wall_s": wall}
+    file.write_text(json.dumps(record, indent=1) + "\n")
     write_page(record, given.out)
     say(f"wrote {given.out / 'render.md'}")
 
