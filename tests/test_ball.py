@@ -52,8 +52,8 @@ def test_curve_and_radiance_are_recovered(crops):
     merged = jpeg.merge(frames)
     codes = np.array([40, 80, 160, 220])
     true = ((codes / 255) ** (1 / GAMMA) / (128 / 255) ** (1 / GAMMA))[:, None]
-    # The smoothness term of the curve's fit bends it: 6 % measured over these codes, less in the middle.
-    assert merged.curve[codes] == pytest.approx(true * np.ones(3), rel=0.12)
+    assert merged.curve[codes] == pytest.approx(true * np.ones(3), rel=0.02)  # measured 0.8 %; OpenCV's fit: 6 %
+    assert (np.abs(merged.curve[codes] / true - 1) < 3 * merged.curve_sigma[codes]).all()
 
 
 def test_frame_order_changes_nothing(crops):

@@ -15,7 +15,7 @@ from benchmarks.random_scenes import random_case
 from benchmarks.zscore import LIMIT, Tally, judged, share_out, tallied, tile_pixels, z_of
 
 SCENES = (14, 5, 6, 7)  # glossy with boxes, plane, boxes, walls; glass, rough glass, metal, mirror, emission; lamps
-CPU_S, LIGHT = 3.0, 16
+CPU_S, LIGHT = 3.0, 8
 
 
 @pytest.mark.parametrize("seed", SCENES)

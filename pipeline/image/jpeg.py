@@ -1,8 +1,8 @@
 """Brackets of JPEGs: clearly second best to RAW, because a camera's curve, sharpening and colours are baked in.
 
-The curve is recovered from the bracket itself (Debevec and Malik, Recovering High Dynamic Range Radiance Maps from
-Photographs, 1997, as OpenCV has it), frames are brought onto each other by their content, and merged like counts: the
-longest unclipped exposures weigh most. Colours are the camera's rendering, taken as linear Rec.709; the unit is free.
+Frames are brought onto each other by their content, the curve is recovered from the bracket itself, with its
+uncertainty (`pipeline.image.response`), and they are merged like counts: the longest unclipped exposures weigh most.
+Colours are the camera's rendering, taken as linear Rec.709; the unit is free.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CLIPPED_FROM, DARK_TO = 250, 4  # codes that say no more than "at least" and "at
 CODE_SIGMA = 1.5  # codes: noise, compression and rounding of a phone's JPEG
 ALIGN_BLUR, ALIGN_STEPS, ALIGN_STOP = 5, 200, 1e-6
 MIN_CORRELATION, MAX_SHIFT, MAX_STRETCH = 0.8, 0.15, 0.1  # of aligned frames; shift as a fraction of the width
-CURVE_POINTS, CURVE_SMOOTHNESS = 600, 50.0  # fewer points leave the bright end 20 to 50 % wrong
+WHITE = 255
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Merged:
     clipped: np.ndarray  # in every frame that sees the pixel: a lower bound
     correlations: list[float]  # of each frame with the one before, after alignment
     curve: np.ndarray  # (256, 3) relative exposure of each code
+    curve_sigma: np.ndarray  # (256, 3) its standard uncertainty, relative
 
 
 def read(path: Path) -> JpegFrame:
@@ -115,24 +116,25 @@ def _check_motion(before: str, name: str, correlation: float, step: np.ndarray, 
         )
 
 
-def response(codes: list[np.ndarray], exposures: list[float]) -> np.ndarray:
-    """Relative exposure (256, 3) of each code, 1 at code 128, never falling. Raises CaptureError without an answer."""
-    import cv2
+def response(codes: list[np.ndarray], exposures: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Relative exposure (256, 3) of each code, 1 at code 128, never falling; its relative standard uncertainty."""
+    from pipeline.image.response import TABLE, recover
 
-    solver = cv2.createCalibrateDebevec(CURVE_POINTS, CURVE_SMOOTHNESS, False)
-    stack = [np.clip(np.rint(c), 0, 255).astype(np.uint8) for c in codes]
-    curve = np.asarray(solver.process(stack, times=np.asarray(exposures, np.float32)), float).reshape(256, 3)
-    if not (np.isfinite(curve).all() and (curve[128] > 0).all()):
-        raise CaptureError("the camera's curve cannot be recovered from this bracket; add exposures two stops apart")
-    curve = np.maximum.accumulate(curve, 0)  # noise in its ends, where few pixels are
-    return curve / curve[128]
+    found = recover([codes], [exposures], WHITE)
+    grid, code = np.linspace(0, 1, TABLE), found.above(np.repeat(np.arange(WHITE + 1)[:, None] / WHITE, 3, 1))
+    light, sigma = (
+        np.stack([np.interp(code[:, c], grid, table[:, c]) for c in range(3)], -1)
+        for table in (found.log_light, found.sigma())
+    )
+    return np.exp(light - light[128]), sigma
 
 
 def merge(frames: list[JpegFrame]) -> Merged:
     """Radiance of a bracket (any order). Raises CaptureError: an exposure is missing, or a frame does not fit.
 
     Weights are the exposures of codes that are neither clipped nor dark (photon counts); a pixel without one keeps the
-    shortest exposure's value if it is clipped everywhere, the longest's if dark. The variance is that of the codes.
+    shortest exposure's value if it is clipped everywhere, the longest's if dark. The variance is that of the codes
+    and of the curve.
     """
     missing = [frame.name for frame in frames if not frame.exposure]
     if missing:
@@ -143,17 +145,19 @@ def merge(frames: list[JpegFrame]) -> Merged:
     frames = sorted(frames, key=lambda frame: (-float(frame.exposure or 0), frame.name))
     exposures = [float(frame.exposure or 0) for frame in frames]
     codes, seen, correlations = aligned(frames)
-    curve = response(codes, exposures) if len(frames) > 1 else (np.arange(256)[:, None] / 128.0) ** 2.2 * np.ones(3)
-    total, weight, noise = (np.zeros(codes[0].shape) for _ in range(3))
+    curve, unsure = response(codes, exposures)
+    total, weight, noise, doubt = (np.zeros(codes[0].shape) for _ in range(4))
     bright, dark = np.ones(codes[0].shape, bool), np.zeros(codes[0].shape)
-    steps = np.arange(256)
+    steps = np.arange(WHITE + 1)
     slope = np.gradient(curve, axis=0)
     for code, inside, exposure in zip(codes, seen, exposures):
         light = np.stack([np.interp(code[..., c], steps, curve[:, c]) for c in range(3)], -1) / exposure
         spread = np.stack([np.interp(code[..., c], steps, slope[:, c]) for c in range(3)], -1) * CODE_SIGMA / exposure
+        off = light * np.stack([np.interp(code[..., c], steps, unsure[:, c]) for c in range(3)], -1)
         good = (code < CLIPPED_FROM) & (code > DARK_TO) & inside[..., None]
         total += np.where(good, exposure * light, 0)
         noise += np.where(good, (exposure * spread) ** 2, 0)
+        doubt += np.where(good, exposure * off, 0)
         weight += np.where(good, exposure, 0)
         bright &= (code >= CLIPPED_FROM) | ~inside[..., None]
         dark = np.where(dark > 0, dark, light)  # the longest's: sorted from the longest
@@ -161,5 +165,5 @@ def merge(frames: list[JpegFrame]) -> Merged:
     safe = np.where(none, 1, weight)
     lower = curve[CLIPPED_FROM] / exposures[-1]
     rgb = np.where(none, np.where(bright, lower, dark), total / safe)
-    variance = np.where(none, rgb**2, noise / safe**2)
-    return Merged(rgb, variance, (none & bright).any(-1), correlations, curve)
+    variance = np.where(none, rgb**2, (noise + doubt**2) / safe**2)  # the curve is off in all frames alike
+    return Merged(rgb, variance, (none & bright).any(-1), correlations, curve, unsure)
