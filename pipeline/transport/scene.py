@@ -50,7 +50,7 @@ class Worlds:
     local_with: tuple[Any, ...]
     lights: tuple[LightGroup, ...]
     whole: LightGroup  # all of them together
-    lights_above: tuple[LightGroup, ...]  # only what can reach the local scene, where that is a plane
+    lights_above: tuple[LightGroup, ...]  # what can reach the local scene: on a plane alone, nothing from below it
     plane: Plane
     bounds: np.ndarray  # (K, 4) centre and radius of a sphere around each object, world
     convex: bool = True
@@ -136,12 +136,15 @@ def light_group(mi: Any, name: str, radiance: np.ndarray, emitter: Emitter | Non
     return LightGroup(name, mi.load_dict({"type": "scene", "distant": environment_emitter(mi, radiance)}), emitter)
 
 
-def sky_above(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray) -> LightGroup:
-    """The sky without what lies below the plane and never reaches it."""
+def sky_parts(
+    mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray
+) -> tuple[LightGroup, LightGroup]:
+    """The sky above the plane, and what lies below it: no sample that is meant for the plane is lost on that."""
     sky = environment.copy()
     for emitter in emitters:
         sky.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0.0
-    return light_group(mi, "sky", above_plane(sky, normal))
+    above = above_plane(sky, normal)
+    return light_group(mi, "sky", above), light_group(mi, "below", sky - above)
 
 
 def ground_bsdf(mi: Any, albedo: np.ndarray, surface: Surface | None) -> dict[str, Any]:
@@ -205,6 +208,7 @@ def build_worlds(
         scenes.append((mi.load_dict({**shared, **shapes, **synthetic}), tuple(shapes.values())))
     (with_objects, local_with), (without, _) = scenes
     lights = light_groups(mi, environment, emitters)
+    above, below = sky_parts(mi, environment, emitters, plane.normal)
     hiding = {f"occluder_{o.name}": proxy_shape(mi, o, None) for o in occluders if o.vertices_m is not None}
     return Worlds(
         mi=mi,
@@ -213,7 +217,7 @@ def build_worlds(
         local_with=local_with,
         lights=lights,
         whole=light_group(mi, "all", environment),
-        lights_above=lights if proxies else (sky_above(mi, environment, emitters, plane.normal), *lights[1:]),
+        lights_above=(above, below, *lights[1:]) if proxies else (above, *lights[1:]),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
         convex=not proxies,
