@@ -30,7 +30,7 @@ from tests import joint_world
 from tests.printed_board import looking_at
 
 CHI2_95 = 12.592  # six degrees of freedom
-TRIALS, JOINT_TRIALS = 1000, 240
+TRIALS, JOINT_TRIALS = 1000, 240  # the latter cost half a CPU second each
 SIGMA_PX, LEAST_RATIO = Pose().corner_sigma_px, Pose().min_ambiguity
 TRUE = Camera(
     width=1024, height=768, fx=1100, fy=1100, cx=515, cy=380, distortion=np.array([-0.1, 0.02, 5e-4, -3e-4, 0])

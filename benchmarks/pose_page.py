@@ -1,0 +1,142 @@
+"""The page of the pose benchmark: figures in tables, curves as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from benchmarks.probe_page import OURS, PEER, plain_ticks
+
+COLOURS = (OURS, "#2563eb", "#0f9d76", "#d97706", "#7c3aed")
+MEANT = {
+    "single": "one marker 40 to 300 px wide, 0 to 65 degrees, four corners",
+    "multi": "a plate with one or two of three markers of unknown layout, four views",
+    "board": "24 corners of a board 180 to 600 px wide",
+    "charuco": "6 to 23 of them, the rest hidden",
+    "apriltag": "one tag 80 to 500 px wide",
+    "points": "6 to 15 surveyed points, 0.2 to 2 mm and 0.2 to 1 px, far from the origin, a quarter coplanar",
+    "colmap": "a plate without markers, from tracks of 160 points and two markers in seven further views",
+}
+METHOD = """## Method
+
+- **Boards**: prints on a table, box-filtered over each pixel, through a bent lens, blurred by 0.5 to 1.1 px, noise of
+  1 % of the paper's white; 480 to 560 px wide, 30 degrees off the vertical, from every side. Each lens is calibrated by
+  stage calibrate from ten such photographs of 8 bits. The foot is 4 cm in front of the board. Position is over the
+  distance to the board's middle. `normal_deg` and `contact_px` are the worst photograph's, lens calibrated.
+- **Markers**: plain OpenCV is its detector with sub-pixel corners and `solvePnP` by `IPPE_SQUARE`, first pose, true
+  lens, on the same photographs. A pose more than 10 degrees off is a flip.
+- **Coverage**: corners and tracks with noise, every other lens drawn from a calibration's covariance; the squared error
+  of the six numbers in units of their own covariance is held against chi-square's 95 %; of poses that are not refused.
+  Corners have the noise that stage pose assumes (knob `corner_sigma_px`).
+- **Herzjesu**: K and poses of the set; after one similarity over centres and rotations, each over its own rms residual.
+  The centres lie on a line but for 0.3 m and leave the turn about it open: the similarity of centres alone (*by
+  centres*) turns all cameras alike.
+- **Abakisita**: every third photograph; the board's poses by its corners and the lens that they give, COLMAP's by its
+  own tracks and the lens that they give; centres after a similarity, over the distance to the board.
+"""
+
+
+def curves(record: dict[str, Any], path: Path) -> None:
+    """Single markers over size: errors, refusals and flips; coverage by route; rendered boards."""
+    import matplotlib as mpl
+
+    mpl.use("svg")
+    mpl.rcParams |= {"svg.hashsalt": "insitu", "font.size": 9, "svg.fonttype": "none"}
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(9.5, 7.0), layout="constrained")
+    over_size(axes[0][0], record["markers"], "rot_deg", "Single marker: rotation, median [degrees]")
+    over_size(axes[0][1], record["markers"], "pos_rel", "Single marker: position over distance, median")
+    shares(axes[1][0], record["markers"])
+    by_route(axes[1][1], record["coverage"])
+    for axis in axes.ravel():
+        axis.grid(alpha=0.25, which="both", linewidth=0.5)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
+def over_size(axis: Any, rows: list[dict[str, Any]], key: str, title: str) -> None:
+    """One line per tilt, solid ours, dotted plain OpenCV."""
+    for tilt, colour in zip(sorted({row["tilt_deg"] for row in rows}), COLOURS, strict=False):
+        part = [row for row in rows if row["tilt_deg"] == tilt]
+        size = [row["size_px"] for row in part]
+        nothing = float("nan")
+        for name, line in (("ours", "-o"), ("opencv", ":s")):
+            values = [nothing if row[f"{name}_{key}"] is None else row[f"{name}_{key}"] for row in part]
+            label = f"{tilt}°" if name == "ours" else None
+            axis.loglog(size, values, line, color=colour, markersize=3, label=label)
+    axis.plot([], [], ":s", color=PEER, markersize=3, label="plain OpenCV")
+    plain_ticks(axis, sorted({row["size_px"] for row in rows}))
+    axis.set_xlabel("side [px]")
+    axis.set_title(title)
+    axis.legend(frameon=False, fontsize=8, ncols=2)
+
+
+def shares(axis: Any, rows: list[dict[str, Any]]) -> None:
+    """Refused and not read by ours, flipped unnoticed by either, over size, all tilts together."""
+    sizes = sorted({row["size_px"] for row in rows})
+    looks = {
+        "refused": ("refused, ambiguous", OURS, "-o"), "unseen": ("not read", "#2563eb", "-o"),
+        "ours_flipped": ("flipped, insitu", "black", "-o"), "opencv_flipped": ("flipped, plain OpenCV", PEER, ":s"),
+    }  # fmt: skip
+    for key, (label, colour, line) in looks.items():
+        values = [boards[lens][key][part] for lens in lenses for part in parts]
+        lines.append(f"| {name} | " + " | ".join(f"{value:.2g}" for value in values) + " |")
+    return [
+        *lines, "",
+        f"Corners have an error of {boards['corner_rms_px']:.3f} px rms ({boards['corner_bias_px']:.4f} px in the mean "
+        f"of all, {boards['corner_mean_rms_px']:.3f} px rms in a photograph's mean); stage pose assumes "
+        f"{boards['corner_sigma_stated_px']:g} px, which paper, demosaicking and clipped edges may use up. So "
+        f"regions are wide here: {boards['true_lens']['held_95']:.0%} hold the truth with the true lens, "
+        f"{boards['calibrated_lens']['held_95']:.0%} with a calibrated one.",
+    ]  # fmt: skip
+
+
+def real_lines(real: dict[str, Any]) -> list[str]:
+    """Photographs that were taken."""
+    lines = ["## Herzjesu", ""]
+    if not real["herzjesu"]:
+        return [*lines, "Its photographs were not there."]
+    lines += [
+        "| | centres [mm] | rotation [°] | worst | by centres: [mm] | [°] |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    names = {"with_K": "insitu, K given", "pycolmap_with_K": "pycolmap, K given, as insitu starts it",
+             "without_K": "insitu, no K", "pycolmap": "plain pycolmap, no K"}  # fmt: skip
+    for name, text in names.items():
+        one = real["herzjesu"][name]
+        lines.append(
+            f"| {text} | {one['centre_mm']:.1f} | {one['rot_deg']:.3f} | {one['rot_deg_worst']:.3f} "
+            f"| {one['centre_mm_by_centres']:.1f} | {one['rot_deg_by_centres']:.3f} |"
+        )
+    return lines
+
+
+def write_page(record: dict[str, Any], folder: Path) -> None:
+    """pose.md and its picture, pose.svg."""
+    curves(record, folder / "pose.svg")
+    spent = ", ".join(f"{name} {seconds:.0f}" for name, seconds in record["cpu_seconds"].items())
+    flips = [sum(row[key] for row in record["markers"]) for key in ("ours_flipped", "opencv_flipped", "photographs")]
+    lines = [
+        "# Where the camera was",
+        "",
+        f"Made by `make bench-pose` with {record['threads']} threads (CPU seconds of a machine with other work to do: "
+        f"{spent}); every figure is in [pose.json](pose.json).",
+        "",
+        "![errors and refusals of single markers, coverage of every route](pose.svg)",
+        "",
+        *promised(record),
+        "",
+        *coverage_lines(record["coverage"]),
+        "",
+        *board_lines(record["boards"]),
+        "",
+        "## Single markers",
+        "",
+        f"Of {flips[2]} photographs, {flips[0]} poses flipped unnoticed here and {flips[1]} with plain OpenCV.",
+        "",
+        *real_lines(record["real"]),
+        "",
+        METHOD,
+    ]
+    (folder / "pose.md").write_text("\n".join(lines).rstrip() + "\n")
