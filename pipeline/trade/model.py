@@ -20,6 +20,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.run.live import OFFER_SHARE
+
 FIGURES = ("object", "shadow")
 SAMPLES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # the last is final's
 WIDTHS = (256, 512, 1024, 2048)  # likewise
@@ -155,7 +157,8 @@ class Model:
         texels = (setting.width / self.width) ** 2
         costs = {name: spent * (1 + GROWING.get(name, 0.0) * (texels - 1)) for name, spent in self.stages.items()}
         shown, composite = (start + more * self.megapixels for start, more in (SHOWN, COMPOSITE))
-        costs["render"] = self.render[0] + self.render[1] * self.work.at(setting.samples) + shown
+        sampled = self.render[0] + self.render[1] * self.work.at(setting.samples)
+        costs["render"] = sampled / (1 - OFFER_SHARE) + shown  # later pictures take their share of the time
         costs["composite"] = composite
         return costs
 
