@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks import render
 from benchmarks.cycles import layers
 from benchmarks.estimators import closed_form, load, naive, ours, sun_of
 from benchmarks.measures import Point, cost_at, display, exposure_gain, middle, speedup, squared_error
@@ -154,3 +155,18 @@ def test_page_without_cycles(tmp_path) -> None:
     assert "bench-cycles-env" in page
     assert "two renders | 4 | 3.00 | 1.41" in page
     assert (tmp_path / "render.svg").stat().st_size > 1000
+
+
+def test_a_part_that_was_measured_is_kept_for_the_same_settings(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(render, "KEPT", tmp_path)
+    calls = []
+
+    def part() -> dict[str, object]:
+        calls.append(1)
+        return {"row": len(calls)}
+
+    one, two = {"size": [64, 36]}, {"size": [128, 72]}
+    assert render.measured("part", part, one, True)["rows"] == {"row": 1}
+    assert render.measured("part", part, one, True)["rows"] == {"row": 1}
+    assert render.measured("part", part, two, True)["rows"] == {"row": 2}
+    assert render.measured("part", part, two, False)["rows"] == {"row": 3}

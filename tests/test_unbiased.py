@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.deliberate import Told, figures
 from benchmarks.random_scenes import random_case
-from benchmarks.zscore import LIMIT, Tally, judged, share_out, tallied, tile_pixels, z_of
+from benchmarks.zscore import LIMIT, Tally, judged, line, share_out, summary, tallied, tile_pixels, total, z_of
 
 SCENES = (14, 5, 6, 7)  # glossy with boxes, plane, boxes, walls; glass, rough glass, metal, mirror, emission; lamps
 CPU_S, LIGHT = 3.0, 8
@@ -59,6 +59,38 @@ def test_tally_knows_mean_and_standard_error():
     mean, square = tally.of(tally.values)
     np.testing.assert_allclose(mean[:, 0], [2, 0, 5])
     np.testing.assert_allclose(square[:, 0], [1 / 3, 0, 0])
+
+
+def test_parts_of_an_estimate_add_up():
+    """Paths and thrown light: means and variances add; Welch's degrees of freedom lie between the least and the sum."""
+    random = np.random.default_rng(8)
+    mean = random.normal(size=(500, 6))
+    paths = scattered(random, np.full(500, 20), 0.7 * mean, 0.1)
+    light = scattered(random, np.full(500, 12), 0.3 * mean, 0.2)
+    whole, variance, degrees = total([paths, light])
+    np.testing.assert_allclose(variance, paths.of(paths.values)[1] + light.of(light.values)[1])
+    assert degrees.min() >= 11 - 1e-9
+    assert degrees.max() <= 19 + 11 + 1e-9
+    assert (((whole - mean) ** 2).mean() / variance.mean()) == pytest.approx(1, abs=0.1)  # 3000 squares: 2.6 %
+    other = scattered(random, np.full(500, 100), mean, 0.1)
+    assert np.abs(z_of([paths, light], [other])[0]).max() < LIMIT
+    assert np.abs(z_of([paths], [other])[0]).max() > LIMIT
+
+
+def test_scenes_are_summed_up():
+    """Shares by how many tiles there are; the smallest bias common to all gets smaller with every scene."""
+    random, rows = np.random.default_rng(9), []
+    for count in (4, 40):
+        mean = -random.uniform(0.1, 1.0, (count, 6))
+        fast, reference = (scattered(random, np.full(count, 400), mean, 0.05) for _ in range(2))
+        rows.append(judged([fast], [reference], np.ones((count, 3))) | {"scene": "made up", "cpu_s": 1.0})
+    found = summary(rows)
+    assert found["tile_channels_changed"] == 3 * 44
+    assert found["zscore_max"] == max(row["zscore_max"] for row in rows)
+    reached = sum(row["oracle_reached_changed"] * row["changed"] for row in rows) / 132
+    assert found["oracle_reached_changed"] == pytest.approx(reached)
+    assert found["smallest_detectable_common_bias_rel"] < LIMIT * min(row["bias_sigma_rel"] for row in rows)
+    assert "made up" in line(0, rows[0])
 
 
 def test_same_constants_agree_and_other_constants_never_do():
