@@ -2,8 +2,8 @@
 
 A frame of 24 x 16 pixels, 6 tiles, shows about ten metres: a plane alone, with boxes that see each other, between
 walls, glossy, or glossy with boxes; one to three objects out of every material; a sky with none to two lamps, which
-half of the time are told apart as emitters. Lamps are discs of 4 to 8 degrees: smaller ones would need another order of
-samples behind glass, for the reference finds them there by chance alone.
+half of the time are told apart as emitters. Lamps are discs of 6 to 10 degrees: smaller ones would need another order
+of samples behind glass, for the reference finds them there by chance alone.
 
 Objects are a metre and more in size, for Mitsuba lifts the start of a ray 9e-5 (1 + max |p|) off its surface, as if the
 plane were that much higher. At 0.1 m that is a bias of the reference of 0.1 % of the light beside an object (measured;
@@ -128,7 +128,7 @@ def random_map(random: np.random.Generator) -> tuple[np.ndarray, int]:
     for _ in range(count):
         elevation, azimuth = random.uniform(0.5, 1.4), random.uniform(0, 1)
         toward = direction_from_latlong(np.array(azimuth), np.array(0.5 - elevation / np.pi))
-        inside = directions @ toward > np.cos(np.radians(random.uniform(4, 8)))
+        inside = directions @ toward > np.cos(np.radians(random.uniform(6, 10)))
         level = energy * random.uniform(0.1, 0.8) / solid_angles[inside].sum()
         sky[inside] += level * random.uniform(0.6, 1.0, 3)
     return sky, count
