@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.resimulate import photograph, place_of
-from pipeline.budget.pixels import PLATE_PX, RENDER_PX, SHADOW
+from pipeline.budget.pixels import SHADOW
 from pipeline.image.truth import load_truth
 from pipeline.run.cli import main as insitu
 from pipeline.run.cli import say
@@ -42,48 +42,46 @@ DOCS = Path("docs/benchmarks")
 SCENES = Path("sample_captures/scenes")
 
 
-def regions(truth_plate: np.ndarray, truth: np.ndarray, coverage: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Names and masks (H, W): every object, shadows in tiles. From truth alone, so that all captures share them."""
-    found = {name: cover > 0.999 for name, cover in coverage.items() if (cover > 0.999).sum() >= FEWEST}
-    covered = np.sum(list(coverage.values()), axis=0) > 0
-    change = np.linalg.norm(truth - truth_plate, axis=-1) > SHADOW * np.linalg.norm(truth_plate, axis=-1)
-    for top in range(0, change.shape[0], TILE):
-        for left in range(0, change.shape[1], TILE):
-            mask = np.zeros_like(change)
+def places(truth_file: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Masks (H, W) of single pixels by kind, and of regions by name: objects, shadows in tiles.
+
+    From the truth of the camera that is not turned, a pixel inside edges, so that all captures share them.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    truth = load_truth(truth_file)
+    inside = {name: minimum_filter(cover, 3) > 0.999 for name, cover in truth.coverage.items()}
+    free = maximum_filter(np.sum(list(truth.coverage.values()), axis=0), 3) == 0
+    level = np.linalg.norm(truth.plate, axis=-1)
+    shadow = free & (np.linalg.norm(truth.with_objects - truth.plate, axis=-1) > SHADOW * level)
+    lattice = np.zeros(free.shape, bool)
+    lattice[APART // 2 :: APART, APART // 2 :: APART] = True
+    pixels = {"object": np.any(list(inside.values()), axis=0) & lattice, "shadow": shadow & lattice}
+    means = {name: mask for name, mask in inside.items() if mask.sum() >= FEWEST}
+    for top in range(0, shadow.shape[0], TILE):
+        for left in range(0, shadow.shape[1], TILE):
+            mask = np.zeros_like(shadow)
             part = np.s_[top : top + TILE, left : left + TILE]
-            mask[part] = (change & ~covered)[part]
+            mask[part] = shadow[part]
             if mask.sum() >= FEWEST:
-                found[f"shadow_{top}_{left}"] = mask
-    return found
+                means[f"shadow_{top}_{left}"] = mask
+    return pixels, means
 
 
-def measured(build: Path, truth_file: Path) -> dict[str, Any]:
+def measured(build: Path, truth_file: Path, shared_truth: Path) -> dict[str, Any]:
     """Errors and sigmas of pixels and of regions of one build, and the budget by source."""
     truth = load_truth(truth_file)
     composite, plate = read_exr(build / "composite/composite.exr"), read_exr(build / "develop/photographs/plate.exr")
     unsure = read_exr(build / "uncertainty/uncertainty.exr")
     scale = float(np.median(np.linalg.norm(plate.rgb(), axis=-1) / np.linalg.norm(truth.plate, axis=-1)))
     error, sigma = composite.rgb() - scale * truth.with_objects, unsure.rgb("sigma").astype(float)
-    own = {name: unsure.rgb(name).astype(float) ** 2 for name in ("plate", "render")}
+    own = unsure.rgb("of_means").astype(float) ** 2
     modes = [unsure.rgb(f"mode_{name}").astype(float) for name in unsure.attributes["insitu:modes"].split(",")]
-    change = np.linalg.norm(truth.with_objects - truth.plate, axis=-1)
-    covered = np.sum(list(truth.coverage.values()), axis=0)
-    kinds = {
-        "object": covered > 0.999,
-        "shadow": (covered == 0) & (change > SHADOW * np.linalg.norm(truth.plate, axis=-1)),
-    }
-    lattice = np.zeros(covered.shape, bool)
-    lattice[APART // 2 :: APART, APART // 2 :: APART] = True
-    pixels = {
-        kind: {"error": error[mask & lattice].tolist(), "sigma": sigma[mask & lattice].tolist()}
-        for kind, mask in kinds.items()
-    }
+    pixels, regions = places(shared_truth)
+    single = {kind: {"error": error[mask].tolist(), "sigma": sigma[mask].tolist()} for kind, mask in pixels.items()}
     means: dict[str, Any] = {}
-    for name, mask in regions(truth.plate, truth.with_objects, truth.coverage).items():
-        variance = sum(
-            own[source][mask].mean(0) * min(1.0, alike / mask.sum())
-            for source, alike in (("plate", PLATE_PX), ("render", RENDER_PX))
-        )
+    for name, mask in regions.items():
+        variance = own[mask].mean(0) / mask.sum()
         shared = sum(mode[mask].mean(0) ** 2 for mode in modes)
         means[name] = {
             "error": error[mask].mean(0).tolist(), "sigma": np.sqrt(variance + shared).tolist(),
@@ -91,7 +89,7 @@ def measured(build: Path, truth_file: Path) -> dict[str, Any]:
         }  # fmt: skip
     budget = json.loads((build / "uncertainty/budget.json").read_text())
     seconds = {s: json.loads((build / s / "record.json").read_text())["cpu_seconds"] for s in ("render", "uncertainty")}
-    return {"scale": scale, "pixels": pixels, "means": means, "budget": budget["regions"], "cpu_seconds": seconds}
+    return {"scale": scale, "pixels": single, "means": means, "budget": budget["regions"], "cpu_seconds": seconds}
 
 
 def build_one(scene: Any, pictures: Any, number: int, folder: Path) -> None:
@@ -105,7 +103,7 @@ def build_one(scene: Any, pictures: Any, number: int, folder: Path) -> None:
         ["run", str(work / "capture"), "--out", str(out), "--quality", "draft", "--upto", "uncertainty", *asked]
     )
     if code == 0:
-        found = measured(out, work / "capture/truth/truth.json")
+        found = measured(out, work / "capture/truth/truth.json", folder / "radiance/truth/truth.json")
         part = folder / f"capture_{number:03d}.part"
         part.write_text(json.dumps(found))
         part.rename(part.with_suffix(".json"))

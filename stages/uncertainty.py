@@ -45,13 +45,17 @@ def compute(
     on_lost, on_gained = slopes(layers, plate, records, free)
     size = np.abs(layers.rgb("lost")) + np.abs(layers.rgb("gained"))
     share = np.divide(np.abs(layers.rgb("lost")), size, out=np.full(size.shape, 0.5), where=size > 0)
-    own = {
-        "plate": pixels.plate_variance(mul, plate.rgb("variance")),
-        "render": pixels.render_variance(
-            share * on_lost + (1 - share) * on_gained, layers.rgb("without"), composite.rgb("obj"),
-            layers["noise.change"], layers["noise.obj"] * free,
-        ),
-    }  # fmt: skip
+    on_change = share * on_lost + (1 - share) * on_gained
+    remaining, sampled = (
+        pixels.render_variance(on_change, layers.rgb("without"), composite.rgb("obj"), change, obj * free)
+        for change, obj in (
+            (layers["noise.change"], layers["noise.obj"]),
+            (rms(layers.rgb("variance")), rms(layers.rgb("objvariance"))),
+        )
+    )
+    shown = pixels.plate_variance(mul, plate.rgb("variance"))
+    own = {"plate": shown, "render": remaining}
+    means = {"plate": pixels.PLATE_PX * shown, "render": sampled}
     changed = (size > FOLLOWED_CHANGE * layers.rgb("without")).any(-1) & (layers["ground"] > 0)
     wanted = ((layers["obj.A"] > 0) | changed) & (free > 0)
     modes: list[pixels.Mode] = []
@@ -76,12 +80,13 @@ def compute(
         evidence = reasons(followed, left, params.share)
     picture = composite.rgb()
     variance = pixels.total_variance(list(own.values()), modes, window)
-    fall = pixels.waterfall(picture, plate.rgb(), composite["obj.A"], own, modes, window)
+    fall = pixels.waterfall(picture, plate.rgb(), composite["obj.A"], own, means, modes, window)
     unknown = int((~np.isfinite(variance)).any(-1).sum())
     numbers |= {"unknown_px": unknown, "modes": {mode.name: mode.source for mode in modes}}
     numbers |= {f"{region}_sigma_rel": part["pixel_rel"]["total"] for region, part in fall.items()}
     numbers |= {f"{region}_mean_sigma_rel": part["mean_rel"]["total"] for region, part in fall.items()}
     parts = {"sigma": np.sqrt(variance), **{name: np.sqrt(part) for name, part in own.items()}}
+    parts["of_means"] = np.sqrt(pixels.of_means(shown, sampled))
     for mode in modes:
         parts[f"mode_{mode.name}"] = np.zeros(picture.shape, np.float32)
         parts[f"mode_{mode.name}"][window] = mode.change
@@ -97,7 +102,7 @@ def compute(
 
 SIGMA = (
     "sigma^2 = plate^2 + render^2 + sum(mode^2); modes are signed, independent of each other, one sigma each; channels "
-    "of flux and sky modes are independent too"
+    "of flux and sky modes are independent too; of the mean over n px: sum(of_means^2) / n^2 + sum(mean(mode)^2)"
 )
 
 
@@ -134,6 +139,11 @@ class Studio:
     def seen(self, rgb: np.ndarray, emitters: list[Emitter], ground: float = 1.0) -> Seen:
         """A render."""
         return rendered(self.worlds(rgb, emitters, ground), self.rays, self.grid, self.samples, DEPTH, seed=1)
+
+
+def rms(variance: np.ndarray) -> np.ndarray:
+    """(H, W) root of the mean over the channels of (H, W, 3)."""
+    return np.asarray(np.sqrt(np.mean(variance, -1)))
 
 
 def settings(records: dict[str, Any], stage: str, knob: str, otherwise: Any) -> Any:

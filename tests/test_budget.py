@@ -20,6 +20,7 @@ from pipeline.types import BallFit, Emitter, Raster, Surface, View
 from stages import knobs, uncertainty
 
 LAMP = np.array([0.4, 0.8, 0.447])
+LAYERS = ("obj", "lost", "gained", "without", "variance", "objvariance")
 
 
 def environment(rgb: np.ndarray, sigma: np.ndarray | float = 0.0, shared: str = "0 0 0") -> Raster:
@@ -265,7 +266,8 @@ def budget_of(exposure: float) -> tuple[np.ndarray, dict]:
     window = np.s_[8:24, 4:20]
     modes = [pixels.Mode("scale", "scale", 0.01 * obj[window]), pixels.Mode("p", "pose", 0.02 * composite[window])]
     sigma = np.sqrt(pixels.total_variance(list(own.values()), modes, window))
-    return sigma, pixels.waterfall(composite, plate, alpha, own, modes, window)
+    means = {"plate": pixels.PLATE_PX * own["plate"], "render": 4 * own["render"]}
+    return sigma, pixels.waterfall(composite, plate, alpha, own, means, modes, window)
 
 
 def test_twice_the_exposure_is_twice_the_sigma():
@@ -283,9 +285,10 @@ def test_sources_of_a_waterfall_add_in_squares():
             total = parts.pop("total")
             assert np.sqrt(sum(value**2 for value in parts.values())) == pytest.approx(total, rel=1e-9)
     assert fall["object"]["mean_rel"]["scale"] == pytest.approx(0.01, rel=1e-9)  # of the objects' mean
-    object_pixel, object_mean = (fall["object"][key]["render"] for key in ("pixel_rel", "mean_rel"))
-    assert object_mean == pytest.approx(object_pixel, rel=1e-9)  # 64 pixels: one tile, alike
-    assert fall["shadow"]["mean_rel"]["plate"] < 0.3 * fall["shadow"]["pixel_rel"]["plate"]  # of 128: root 5 / 128
+    pixel, mean = (fall["object"][key]["render"] for key in ("pixel_rel", "mean_rel"))
+    assert mean == pytest.approx(pixel * np.sqrt(4 / 64), rel=1e-9)  # 64 px, samples four times as noisy
+    pixel, mean = (fall["shadow"][key]["plate"] for key in ("pixel_rel", "mean_rel"))
+    assert mean == pytest.approx(pixel * np.sqrt(5 / fall["shadow"]["pixels"]), rel=0.05)  # relative to rms and to mean
 
 
 def test_stored_pictures_keep_infinity_and_digits():
@@ -366,7 +369,7 @@ def test_nothing_inserted_is_the_plate_and_its_sigma():
     variance = (0.01 * rgb) ** 2
     variance[3, 4] = np.inf
     plate = Raster({**Raster.split(rgb), **Raster.split(variance, "variance")}, "acescg")
-    names = [f"{layer}.{c}" for layer in ("obj", "lost", "gained", "without", "variance") for c in "RGB"]
+    names = [f"{layer}.{c}" for layer in LAYERS for c in "RGB"]
     layers = Raster({n: np.zeros((16, 24)) for n in [*names, "obj.A", "ground", "noise.change", "noise.obj"]}, "acescg")
     channels = {**Raster.split(rgb), **Raster.split(np.ones_like(rgb), "mul"), **Raster.split(0 * rgb, "add")}
     composite = Raster({**channels, **Raster.split(0 * rgb, "obj"), "obj.A": np.zeros((16, 24))}, "acescg")

@@ -2,8 +2,9 @@
 
 C = plate * mul + add + obj, so that of its own a pixel has mul^2 times the plate's variance and what sampling and
 denoising left of the render. Modes are signed pictures, the change of C per standard uncertainty; they are independent
-of each other, so squares add. Means over regions are not as sure as independent pixels would make them: a mode keeps
-its size, and what is the pixel's own is alike over `PLATE_PX` (demosaicking) and `RENDER_PX` (denoising) pixels.
+of each other, so squares add. Means over regions: a mode keeps its size; of what is the pixels' own, neighbours share
+some, by demosaicking (`PLATE_PX`) and by denoising. A denoiser moves noise about and keeps its sum, so that the mean of
+a region is as unsure as the samples were before it: `of_means` is what independent pixels would need for that.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import numpy as np
 # Pixels that share one sample's worth of noise: sum of the autocovariance over the variance. Bilinear demosaicking of
 # independent photosites: 4 / (9/16) = 7.1 for red and blue, 2 / (5/8) = 3.2 for green; camera to ACEScg mixes them.
 PLATE_PX = 5.0
-RENDER_PX = 64.0  # the tile of 8 x 8 pixels over which the denoiser's error is told; it smooths about as far
 SHADOW = 0.05  # relative change of the plate that is called a shadow, as `evaluate` has it
 COVERED = 0.999
 
@@ -51,6 +51,14 @@ def render_variance(
     return parts
 
 
+def of_means(plate: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """(H, W, 3) variance of independent pixels whose means over regions are as unsure as the real ones'.
+
+    ``plate``: the plate's part; ``samples``: the render's before it was denoised; both (H, W, 3).
+    """
+    return np.asarray(PLATE_PX * plate + samples)
+
+
 def total_variance(own: list[np.ndarray], modes: list[Mode], window: tuple[slice, slice]) -> np.ndarray:
     """(H, W, 3): the pixels' own variances and the squares of all modes."""
     total = np.sum(own, axis=0)
@@ -66,13 +74,14 @@ def regions(composite: np.ndarray, plate: np.ndarray, alpha: np.ndarray) -> dict
 
 
 def waterfall(
-    composite: np.ndarray, plate: np.ndarray, alpha: np.ndarray, own: dict[str, np.ndarray], modes: list[Mode],
-    window: tuple[slice, slice],
+    composite: np.ndarray, plate: np.ndarray, alpha: np.ndarray, own: dict[str, np.ndarray],
+    means: dict[str, np.ndarray], modes: list[Mode], window: tuple[slice, slice],
 ) -> dict[str, Any]:  # fmt: skip
     """Per region and source: relative standard uncertainty of a pixel (RMS) and of the region's mean, over RGB norms.
 
-    Relative to the composite; ``of_change`` to the mean change, for shadows. Pixels of infinite variance are left out
-    and counted.
+    ``own``: variances of pixels by source; ``means``: the same, as means of regions need them (see `of_means`).
+    Relative to the composite; ``mean_of_change`` to the mean change, for shadows. Pixels of infinite variance are
+    left out and counted.
     """
     found: dict[str, Any] = {}
     for name, where in regions(composite, plate, alpha).items():
@@ -84,10 +93,8 @@ def waterfall(
         square = np.mean(np.square(composite[known]).sum(-1))
         change = np.linalg.norm((composite - plate)[known].mean(0))
         sources: dict[str, list[float]] = {}
-        alike = {"plate": PLATE_PX, "render": RENDER_PX}
         for source, variance in own.items():
-            mean = variance[known].mean(0).sum()
-            sources[source] = [mean / square, mean * min(1.0, alike.get(source, 1.0) / count)]
+            sources[source] = [variance[known].mean(0).sum() / square, means[source][known].mean(0).sum() / count]
         for mode in modes:
             part = mode.change[inside]
             old = sources.setdefault(mode.source, [0.0, 0.0])
