@@ -73,8 +73,18 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
+HARD := courtyard
+figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the captures that are hard in one way (minutes)
+	@for c in $(HARD); do for q in preview draft; do \
+		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; \
+		$(INSITU) evaluate sample_captures/$$c --out build/figures/$${c}_preview --with-truth probe,pose,camera,albedo; done
+	@$(INSITU) figures $(foreach c,$(HARD),$(foreach q,preview draft,build/figures/$(c)_$(q))) > docs/figures_hard.md
+
 extremes: $(READY)  ## run every case of tests/extremes/cases.toml, into docs/numerics.md, numerics.json and formulas.json
 	$(VENV)/bin/python -m pytest -m extreme --extremes=docs tests
+
+accuracy: $(READY)  ## regenerate docs/accuracy.md: what is promised beside what records of real runs say
+	@$(VENV)/bin/python -m benchmarks.accuracy > docs/accuracy.md.part && mv docs/accuracy.md.part docs/accuracy.md
 
 trade: $(READY)  ## measure what speed costs in accuracy on CAPTURE, into build/<capture>/trade (an hour or more)
 	@$(INSITU) trade $(CAPTURE) --out $(OUT)
@@ -91,6 +101,9 @@ bench-render: $(READY)  ## measure the render at equal error, for docs/benchmark
 
 bench-probe: $(READY)  ## measure the probe against truth and peers, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.probe $(BENCH)
+
+bench-pose: $(READY)  ## measure poses against truth, plain OpenCV and pycolmap, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.pose $(BENCH)
 
 bench-colour: $(READY)  ## measure colours of measured cameras against spectra, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.colour
@@ -124,4 +137,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: extremes trade speed bench-budget bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-pose figures-hard accuracy extremes trade speed bench-budget bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE

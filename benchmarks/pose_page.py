@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.probe_page import OURS, PEER, plain_ticks
+from benchmarks.probe_page import OURS, PEER, percent, plain_ticks
 
 COLOURS = (OURS, "#2563eb", "#0f9d76", "#d97706", "#7c3aed")
 MEANT = {
@@ -80,8 +80,94 @@ def shares(axis: Any, rows: list[dict[str, Any]]) -> None:
         "ours_flipped": ("flipped, insitu", "black", "-o"), "opencv_flipped": ("flipped, plain OpenCV", PEER, ":s"),
     }  # fmt: skip
     for key, (label, colour, line) in looks.items():
-        values = [boards[lens][key][part] for lens in lenses for part in parts]
-        lines.append(f"| {name} | " + " | ".join(f"{value:.2g}" for value in values) + " |")
+        values = [
+            sum(row[key] for row in rows if row["size_px"] == size)
+            / sum(row["photographs"] for row in rows if row["size_px"] == size)
+            for size in sizes
+        ]
+        axis.semilogx(sizes, values, line, color=colour, markersize=3, label=label)
+    plain_ticks(axis, sizes)
+    axis.set_xlabel("side [px]")
+    axis.set_title("Single marker: share of photographs")
+    axis.legend(frameon=False, fontsize=8)
+
+
+def by_route(axis: Any, routes: dict[str, Any]) -> None:
+    """Share of regions that hold the truth, with its 95 % interval."""
+    for at, found in enumerate(routes.values()):
+        low, high = found["interval"]
+        share = found["held_95"]
+        axis.errorbar([at], [share], [[share - low], [high - share]], fmt="o", color=OURS, capsize=4, markersize=5)
+    axis.axhspan(0.90, 0.98, color="black", alpha=0.06)
+    axis.set_xticks(range(len(routes)), list(routes))
+    axis.set_ylim(0.85, 1.0)
+    axis.set_title("95 % regions that hold the truth")
+
+
+def table_head(names: tuple[str, ...]) -> list[str]:
+    """The first two lines of a table."""
+    return [f"| {' | '.join(names)} |", "|" + " --- |" * len(names)]
+
+
+def promised(record: dict[str, Any]) -> list[str]:
+    """What was asked and what was measured."""
+    real = record["real"]
+    plain = real["herzjesu"].get("pycolmap", {})
+    rows = [
+        ("reprojection, median", f"{record['reproj_px']:.3f} px", "0.2 px"),
+        ("rotation, median", f"{record['rot_deg_30']:.4f}°", "0.05°"),
+        ("position over distance, median", percent(record["pos_rel_30"]), "0.1 %"),
+        ("position, lens calibrated, median", percent(record["pos_rel_30_calibrated"]), "0.2 %"),
+        ("plane's normal, lens calibrated, worst", f"{record['normal_deg']:.3f}°", "0.2°"),
+        ("contact at the object's foot, lens calibrated, worst", f"{record['contact_px']:.3f} px", "0.5 px"),
+    ]
+    if real["herzjesu"]:
+        rows += [
+            ("herzjesu, rotation, K given", f"{record['herzjesu_rot_deg']:.3f}°", "0.1°"),
+            (
+                "herzjesu, centres, K given", f"{record['herzjesu_centre_mm']:.1f} mm",
+                f"plain pycolmap: {plain['centre_mm']:.1f} mm",
+            ),
+        ]  # fmt: skip
+    if real["abakisita"]:
+        rows += [
+            ("abakisita, markers against COLMAP, median", percent(record["abakisita_rel_median"]), "0.3 %"),
+            ("abakisita, 90 %", percent(real["abakisita"]["rel_p90"]), "0.6 %"),
+        ]
+    for name, one in real["captures"].items():
+        rows += [
+            (f"{name}, plate, lens estimated: rotation ({one['route']})", f"{one['rot_deg']:.3f}°", "-"),
+            (f"{name}, plate, lens estimated: position over distance", percent(one["pos_rel"]), "-"),
+        ]
+    lines = table_head(("what", "measured", "asked"))
+    return lines + [f"| {what} | {measured} | {asked} |" for what, measured, asked in rows]
+
+
+def coverage_lines(routes: dict[str, Any]) -> list[str]:
+    """A row per route."""
+    head = ("route", "what is simulated", "poses", "refused", "held", "95 % interval", "mean chi2 of 6")
+    lines = ["## Coverage", "", *table_head(head)]
+    for name, found in routes.items():
+        low, high = found["interval"]
+        lines.append(
+            f"| {name} | {MEANT[name]} | {found['trials']} | {found['refused']} | {found['held_95']:.1%} "
+            f"| {low:.1%} to {high:.1%} | {found['chi2_mean']:.2f} |"
+        )
+    return lines
+
+
+def board_lines(boards: dict[str, Any]) -> list[str]:
+    """Spread of the errors of rendered boards, and what the corners' noise is beside what is assumed."""
+    names = {
+        "reproj_px": "reprojection [px]", "rot_deg": "rotation [°]", "pos_rel": "position over distance",
+        "normal_deg": "normal [°]", "contact_px": "contact [px]",
+    }  # fmt: skip
+    head = ("", "median", "95 %", "worst", "calibrated: median", "95 %", "worst")
+    lines = [f"## {boards['photographs']} rendered boards", "", *table_head(head)]
+    lenses, parts = ("true_lens", "calibrated_lens"), ("median", "p95", "worst")
+    for key, name in names.items():
+        shown = [f"{boards[lens][key][part]:.2g}" for lens in lenses for part in parts]
+        lines.append(f"| {name} | " + " | ".join(shown) + " |")
     return [
         *lines, "",
         f"Corners have an error of {boards['corner_rms_px']:.3f} px rms ({boards['corner_bias_px']:.4f} px in the mean "
