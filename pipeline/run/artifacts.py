@@ -125,8 +125,8 @@ PLATE_DISPLAY = Artifact("plate_display", "picture", "plate through the display 
 UNCERTAINTY = Artifact(
     "uncertainty",
     "raster",
-    "standard uncertainty of the composite: sigma.RGB, its parts plate and render, and mode_k.RGB, the change per one "
-    "sigma of each shared error",
+    "standard uncertainty of the composite: sigma.RGB, its parts plate and render, of_means for sums over regions, and "
+    "mode_k.RGB, the change per one sigma of each shared error",
     RADIANCE_UNIT,
     ACESCG,
 )
