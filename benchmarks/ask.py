@@ -12,6 +12,7 @@ import os
 import platform
 import subprocess
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ INTRODUCTION = """# An error or a time, asked of the desk
 `make bench-ask` runs `insitu run sample_captures/desk` with each question, one after the other in one build folder, so
 that they share a pilot. The error is the larger of `object_rel_err` and `shadow_change_err`; *by its records* is what a
 run says of itself without truth. CPU seconds are of the stages up to the composite; *with the pilot* is what was spent
-from nothing, what the pilot left finished not counted twice. {machine}, {cores} cores, load {load:.1f} at the end.
+from nothing, what the pilot left finished not counted twice. {machine}, {cores} cores, load {load:.1f} at the end{busy}.
 
 | asked | samples | map [px] | predicted | by its records | against truth | CPU s predicted | taken | with the pilot |
 |---|---:|---:|---:|---:|---:|---:|---:|---:|
@@ -50,17 +51,19 @@ def verdict(runs: Sequence[dict[str, Any]]) -> str:
     apart = max(abs(run["reached"]["cpu_seconds"] / run["predicted"]["cpu_seconds"] - 1) for run in runs)
     costs = [run["reached"]["cpu_seconds"] for run in asked]
     distinct = len({json.dumps(run["settings"], sort_keys=True) for run in asked})
-    return (
+    words = (
         f"Reached over asked, against truth: {worst:.2f} at most (bound {ALLOWED}). CPU seconds are within {apart:.0%} "
         f"of what was predicted (bound {TIME:.0%}). {distinct} distinct settings, the dearest "
-        f"{max(costs) / min(costs):.1f} times the cheapest (asked: 3, and 4 times).\n"
+        f"{max(costs) / min(costs):.1f} times the cheapest (asked: 3, and 4 times)."
     )
+    return textwrap.fill(words, 120) + "\n"
 
 
 def page(runs: Sequence[dict[str, Any]]) -> str:
     """Markdown."""
-    about = {"machine": platform.machine(), "cores": os.cpu_count(), "load": os.getloadavg()[1]}
-    return INTRODUCTION.format(**about) + "\n".join(map(line_of, runs)) + "\n\n" + verdict(runs)
+    about: dict[str, Any] = {"machine": platform.machine(), "cores": os.cpu_count() or 1, "load": os.getloadavg()[1]}
+    busy = ": busy with other work, seconds are indicative" if about["load"] > 1.5 * about["cores"] else ""
+    return INTRODUCTION.format(**about, busy=busy) + "\n".join(map(line_of, runs)) + "\n\n" + verdict(runs)
 
 
 def main() -> None:
