@@ -26,7 +26,9 @@ INTRODUCTION = """# An error or a time, asked of the desk
 `make bench-ask` runs `insitu run sample_captures/desk` with each question, one after the other in one build folder, so
 that they share a pilot. The error is the larger of `object_rel_err` and `shadow_change_err`; *by its records* is what a
 run says of itself without truth. CPU seconds are of the stages up to the composite; *with the pilot* is what was spent
-from nothing, what the pilot left finished not counted twice. {machine}, {cores} cores, load {load:.1f} at the end{busy}.
+from nothing, what the pilot left finished not counted twice.
+
+{machine}, {cores} cores, load {load:.1f} at the end{busy}.
 
 | asked | samples | map [px] | predicted | by its records | against truth | CPU s predicted | taken | with the pilot |
 |---|---:|---:|---:|---:|---:|---:|---:|---:|
