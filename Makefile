@@ -99,6 +99,9 @@ bench-ask: $(READY)  ## ask errors and a time of the desk, and say what was reac
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)
 
+bench-zscore: $(READY)  ## test the fast strategy for bias against the reference, for docs/benchmarks (scenes are kept)
+	@$(VENV)/bin/python -m benchmarks.zscore $(BENCH)
+
 bench-probe: $(READY)  ## measure the probe against truth and peers, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.probe $(BENCH)
 
@@ -137,4 +140,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: bench-pose figures-hard accuracy extremes trade speed bench-budget bench-colour bench-render bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-pose figures-hard accuracy extremes trade speed bench-budget bench-colour bench-render bench-zscore bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
