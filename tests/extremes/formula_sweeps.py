@@ -147,7 +147,7 @@ def limit(error: Error, sweep: np.ndarray) -> tuple[float, float, float | None]:
 SWEEPS: list[tuple[str, str, Error, np.ndarray, str, str]] = [
     (
         "(4) `LS_obj - LS_noobj`", "2 / f, f the relative change", difference, np.geomspace(1, 1e-9, 37), "f below",
-        "the change is estimated itself, as lost and gained light, never as the difference of two pictures",
+        "the default estimates the change itself, as lost and gained light; only `reference` subtracts",
     ),
     (
         "(5) `1 + lost / LS_noobj`", "(1 - s) / s, s the light left", shade, np.geomspace(1, 1e-9, 37), "s below",
@@ -167,11 +167,11 @@ SWEEPS: list[tuple[str, str, Error, np.ndarray, str, str]] = [
     ),
     (
         "unwrap, `d cos(theta) / d cos(rho)`", "1 / (2 d), d = 1 - sine", gain, np.geomspace(0.5, 1e-9, 36), "d below",
-        "the rim ends at d = 0.01 or earlier, by the outline's uncertainty",
+        "the rim ends whole pixels inside the outline: d above 1e-3 up to a radius of 1000 px",
     ),
     (
         "rim, `2 asin(s) - asin(k s)` (rad)", "1 / sqrt(2 d)", rim, np.geomspace(0.5, 1e-9, 36), "d below",
-        "float64 for fits; float32 in the map, where the rim ends at d = 0.01",
+        "float64 for fits; float32 in the map, where d ends likewise",
     ),
     (
         "pole, `acos(y)`", "1 / theta^2", pole, np.geomspace(1, 1e-9, 37), "theta below",
@@ -190,11 +190,11 @@ SWEEPS: list[tuple[str, str, Error, np.ndarray, str, str]] = [
     ),
     (
         "irradiance of the sky, all less the sun", "(sun + sky) / sky", sky_beside_sun, np.geomspace(1, 1e12, 37),
-        "sun over sky above", "not used: sky and sun are sets of texels, each summed alone in float64",
+        "sun over sky above", "sets of texels, each summed alone; only shares of light groups subtract, in float64",
     ),
     (
         "covariance, `inv(J^T J)`", "cond(J)^2", lambda t, x: deviations(t, x, False), np.geomspace(0.3, 30, 21),
-        "metres above", "not used: see the next row",
+        "metres above", "poses: see the next row; bundle and marker map invert it scaled, in float64",
     ),
     (
         "covariance by QR", "cond(J)", lambda t, x: deviations(t, x, True), np.geomspace(0.3, 30, 21), "metres above",

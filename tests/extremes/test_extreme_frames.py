@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 from types import SimpleNamespace
 
@@ -124,7 +125,8 @@ def test_horizon_in_the_frame(saw):
     )
 
 
-@settings(max_examples=40)
+@pytest.mark.slow
+@settings(max_examples=20)
 @given(
     tilt=st.floats(0, 80), azimuth=st.floats(0, 360), distance=st.floats(-1, 2), sigma=st.floats(-2, 0.3),
     scale=st.floats(-3, 3),
@@ -255,4 +257,5 @@ def test_disk_full(capsys, tmp_path, saw):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not (out / "merge/record.json").exists()
     assert not [path for path in out.rglob("*") if path.suffix in (".exr", ".part") or path.name.startswith(".plate")]
-    saw("machine.disk_full", "refused", said=line.replace(str(tmp_path), "..."))
+    said = re.sub(r"\.\w+\.\w{8}/", "", line.replace(str(tmp_path), "..."))  # without the temporary folder
+    saw("machine.disk_full", "refused", said=said)
