@@ -24,13 +24,24 @@ def desk_build(tmp_path_factory) -> Path:
     return out
 
 
+def draft_of(name: str, tmp_path_factory) -> Path:
+    """A draft build of a bundled capture, by the command."""
+    out = tmp_path_factory.mktemp(name) / "build"
+    done = command("run", SAMPLES / name, "--out", out, "--quality", "draft")
+    assert done.returncode == 0, done.stderr
+    return out
+
+
 @pytest.fixture(scope="session")
 def counter_build(tmp_path_factory) -> Path:
     """Build folder of ``insitu run sample_captures/counter --quality draft``; read it, never write into it."""
-    out = tmp_path_factory.mktemp("counter") / "build"
-    done = command("run", SAMPLES / "counter", "--out", out, "--quality", "draft")
-    assert done.returncode == 0, done.stderr
-    return out
+    return draft_of("counter", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def courtyard_build(tmp_path_factory) -> Path:
+    """Build folder of ``insitu run sample_captures/courtyard --quality draft``; read it, never write into it."""
+    return draft_of("courtyard", tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

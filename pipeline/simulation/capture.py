@@ -166,7 +166,11 @@ def capture_tables(scene: SimulatedScene) -> Iterator[tuple[str, dict[str, Any]]
     yield "", {"name": scene.name, "truth": "truth/truth.json"}
     yield "[plate]", {"files": ["plate/*.dng"]}
     for view in scene.ball_view:
-        yield "[[ball]]", {"name": view.name, "files": [f"{view.name}/*.dng"], "tripod": view.position_m is None}
+        click = {} if view.click_px is None else {"click_px": view.click_px}
+        yield (
+            "[[ball]]",
+            {"name": view.name, "files": [f"{view.name}/*.dng"], "tripod": view.position_m is None, **click},
+        )
     ball = scene.ball
     yield (
         "[probe]",

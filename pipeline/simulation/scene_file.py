@@ -159,6 +159,7 @@ class ViewFacts(Strict):
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     position_m: Point | None = None
     target_m: Point | None = None
+    click_px: Span | None = Field(None, description="of a ball view: capture.toml says about where the ball is")
 
 
 class Lathe(Strict):
