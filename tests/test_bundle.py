@@ -118,3 +118,6 @@ def test_too_little_is_refused() -> None:
         adjust(few)
     with pytest.raises(NumericalError, match="nothing fixes metre"):
         adjust(Bundle(**{**vars(truth), "markers": [], "corners": []}))
+    blind = Bundle(**{**vars(truth), "poses": [*truth.poses, np.eye(4)], "camera_of": np.zeros(11, int)})
+    with pytest.raises(NumericalError, match="do not fix the poses"):
+        adjust(blind)

@@ -415,7 +415,10 @@ def _fixed_by_corners(
     terms = _terms(bundle)
     own, _ = _marker_equations(terms, _weights(terms, used, sigma), bundle, layout)
     reduced, _, _ = _reduce(_system(bundle, start, layout, priors, anchor, used, sigma), 1e-9)
-    return float(np.trace(np.linalg.solve(reduced, own)))
+    size = np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+    scale = np.outer(size, size)
+    # least squares: where nothing fixes an unknown, `_finish` says so
+    return float(np.trace(np.linalg.lstsq(reduced / scale, own / scale, rcond=None)[0]))
 
 
 def _noise(
