@@ -155,6 +155,8 @@ def test_a_coarser_map_has_the_same_light_and_the_same_texels():
     means = [one.rgb().astype(float).mean((0, 1)) for one in (coarse, light)]
     assert means[0] == pytest.approx(means[1], rel=1e-6)
     assert (coarse.rgb()[::2] == coarse.rgb()[1::2]).all()
+    odd = Raster({"Y": np.arange(15.0).reshape(3, 5).astype(np.float32)}, "data")
+    assert pilot.coarser(odd).shape == (3, 5)
     masked = Raster({"mask": np.array([[0, 8], [1, 0]], np.uint32)}, "data")
     assert pilot.shrunk(masked, 2)["mask"] == [[8]]
 

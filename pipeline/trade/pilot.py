@@ -58,12 +58,15 @@ def shrunk(raster: Raster, factor: int) -> Raster:
 
 
 def coarser(environment: Raster) -> Raster:
-    """The map at half its width, each texel repeated, so that emitters keep their texels."""
-    half = shrunk(environment, 2)
-    return Raster(
-        {name: values.repeat(2, 0).repeat(2, 1) for name, values in half.channels.items()}, environment.space,
-        environment.attributes,
-    )  # fmt: skip
+    """The map at half its width, each texel repeated, so that emitters keep their texels; an odd edge is continued."""
+    rows, columns = environment.shape
+    half = shrunk(environment, 2).channels
+    whole = {name: values.repeat(2, 0).repeat(2, 1) for name, values in half.items()}
+    channels = {
+        name: np.pad(values, ((0, rows - values.shape[0]), (0, columns - values.shape[1])), "edge")
+        for name, values in whole.items()
+    }
+    return Raster(channels, environment.space, environment.attributes)
 
 
 def differences(layers: Raster, other: Raster) -> dict[str, float | None]:
