@@ -1,4 +1,4 @@
-"""The fast strategy against the reference: z of tile means on four random scenes, and that a bias would be found.
+"""The fast strategy against the reference: z of tile means on a few random scenes, and that a bias would be found.
 
 `benchmarks.zscore` does the same on twenty scenes with more samples.
 """
@@ -14,11 +14,11 @@ from benchmarks.deliberate import Told, figures
 from benchmarks.random_scenes import random_case
 from benchmarks.zscore import LIMIT, Tally, judged, line, share_out, summary, tallied, tile_pixels, total, z_of
 
-SCENES = (14, 5, 6, 7)  # glossy with boxes, plane, boxes, walls; glass, rough glass, metal, mirror, emission; lamps
+SCENES = (14, 5, 7)  # glossy with boxes, plane, walls; glass, rough glass, metal, mirror, emission; lamps told apart
 CPU_S, LIGHT = 3.0, 8
 
 
-@pytest.mark.parametrize("seed", SCENES)
+@pytest.mark.parametrize("seed", [*SCENES, pytest.param(6, marks=pytest.mark.slow)])
 def test_fast_strategy_has_no_bias_and_one_of_a_tenth_would_be_seen(seed):
     case = random_case(seed)
     found = tallied(case, seed, CPU_S, spp=64, light_count=LIGHT)
