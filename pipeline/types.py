@@ -137,7 +137,7 @@ class View(Record):
 
     world_from_camera: Array  # (4, 4), metres
     covariance: Array  # (6, 6), see conventions
-    route: str  # charuco, marker, points, given, colmap, same_as
+    route: str  # charuco, marker, points, given, colmap, same_as, tripod
     rms_px: float
     points: int  # image points used
     ambiguity: float = np.inf  # squared residual of the second planar solution over the first

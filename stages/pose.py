@@ -9,8 +9,9 @@ that show no marker are oriented by what they share with further photographs: tr
 any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse normal matrix times the larger of
 the stated corner variance and chi2 per degree of freedom, plus the camera's covariance carried through; corners are
 taken as independent. Views from one tripod position are tested for having stayed (chi2 of the difference) and then
-share one pose, estimated from their averaged corners. Limits: a flat board of the stated size; a wrong size scales the
-world unnoticed.
+share one pose, estimated from their averaged corners. A plate without the board gets its pose from a tripod view that
+shows it and from how far both pictures say that the camera turned. Limits: a flat board of the stated size; a wrong
+size scales the world unnoticed.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from pipeline.camera.pose_report import figures, reasons
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.camera.sights import FEWEST_CORNERS, marks_in
+from pipeline.camera.tripod_registration import lender, registered, turn_said, turned
 from pipeline.image.colour import decode_srgb
 from pipeline.probes.standing import standing_chi2
 from pipeline.run.artifacts import (
@@ -95,6 +97,15 @@ def compute(
     if mapped:
         by_marker = by_map(facts, mapped, tripod, photographs, cameras, view_photos, params, warnings)
         views, estimates, places = views | by_marker[0], by_marker[1], by_marker[2]
+    bare: dict[str, Any] = {}
+    shows = lender(sights, tripod, 4 if orders["plate"]["route"] == "marker" else FEWEST_CORNERS)
+    if shows and not orders["plate"]["explicit"]:
+        estimate = estimate_view(shows, orders[shows], sights[shows], camera, params)
+        assert isinstance(estimate, Estimate)
+        estimate = by_ball(facts, shows, estimate, photographs, cameras, params)
+        refuse_named(shows, estimate, params.min_ambiguity)
+        estimates[shows], views[shows] = estimate, view_of(estimate)
+        views["plate"], bare = bare_plate(shows, views[shows], photographs, camera, warnings)
     for name in orders:
         if name not in tripod and name not in views:
             estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
@@ -110,9 +121,22 @@ def compute(
     warnings += board_doubts.of_prints(facts, views, sights, grey(photographs["plate"].rgb()), cameras["plate"])
     for name, shift in {**shifts, **places.pop("tripod_shift_px", {})}.items():
         numbers[name]["tripod_shift_px"] = shift
+    numbers["plate"] |= bare
     numbers |= {key: part for key, part in (("sfm", extra), ("marker_map", places)) if part}
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
     return Result({"views": result, "cloud": cloud}, numbers, warnings, reasons(orders, views, list(cameras.values())))
+
+
+def bare_plate(
+    shows: str, view: View, photographs: dict[str, Raster], camera: Camera, warnings: list[str]
+) -> tuple[View, dict[str, Any]]:
+    """The pose of a plate without a board by a tripod view that shows it, and the registration's figures."""
+    try:
+        found = registered(grey(photographs["plate"].rgb()), grey(photographs[shows].rgb()), camera)
+    except NumericalError as error:
+        raise NumericalError(f"plate: shows no board, and beside {shows} {error}") from error
+    warnings += turn_said(shows, found)
+    return turned(view, found), {"registered_to": shows, "registration": found.evidence}
 
 
 def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:

@@ -62,6 +62,7 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: 
     why = {
         "charuco": "the board is described", "marker": "markers are described", "points": "asked for",
         "given": "asked for", "same_as": "same tripod position as the plate", "colmap": "asked for",
+        "tripod": "shows no board; a view from the same tripod does, and both pictures say how the camera turned",
     }  # fmt: skip
     entries = [
         {
