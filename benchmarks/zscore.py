@@ -1,6 +1,6 @@
 """Is the fast strategy unbiased? Fast minus reference on random scenes, over the standard error of the difference.
 
-    .venv/bin/python -m benchmarks.zscore [--scenes 20] [--cpu-s 60] [--out docs/benchmarks]
+    .venv/bin/python -m benchmarks.zscore [--scenes 20] [--cpu-s 100] [--out docs/benchmarks]
 
 Both strategies estimate the change of the local scene and the object layer on tiles of 8 x 8 pixels. A *replicate* is
 the mean of a tile over ``spp`` samples per pixel with a seed of its own; means and standard errors come from the
@@ -54,7 +54,7 @@ PHOTONS = 1 << 18  # of a replicate of light tracing, of each light
 LIGHT_REPLICATES = 32
 CHANGED, SHADOW = 0.01, 0.05  # of LS_noobj: what counts as changed, and as a shadow (`evaluate` draws the line there)
 WANTED = 0.01  # standard error of the reference over the change
-FAST_SHARE = 1 / 3  # of a scene's CPU seconds for each way of the fast strategy; the rest is the reference's
+FAST_SHARE = 1 / 4  # of a scene's CPU seconds for each way of the fast strategy; the rest is the reference's
 LIMIT = 5.0
 KEPT = Path("build/zscore")
 
@@ -225,7 +225,7 @@ class Tallied:
 
 
 def tallied(case: Case, seed: int, cpu_s: float, spp: int = 256, light_count: int = LIGHT_REPLICATES) -> Tallied:
-    """Replicates of a scene in at most about ``cpu_s`` CPU seconds; a third more where light is traced.
+    """Replicates of a scene in at most about ``cpu_s`` CPU seconds; a quarter more where light is traced.
 
     ``spp`` of the reference; the fast strategy takes 64, as more strata help it little. ``light_count``:
     replicates of light tracing.
@@ -315,7 +315,7 @@ def kept(seed: int, cpu_s: float, folder: Path | None) -> dict[str, Any]:
 
 def run(
     scenes: int = 20,
-    scene_cpu_s: float = 60.0,
+    scene_cpu_s: float = 100.0,
     bias_scenes: int = 4,
     tell: Callable[[str], None] = lambda text: None,
     folder: Path | None = None,
@@ -378,7 +378,7 @@ def main() -> None:
     """Measure, say so, and write it into render.json and its page."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--scenes", type=int, default=20, help="how many")
-    parser.add_argument("--cpu-s", type=float, default=60.0, help="most CPU seconds of a scene's two strategies")
+    parser.add_argument("--cpu-s", type=float, default=100.0, help="most CPU seconds of a scene's two strategies")
     parser.add_argument("--biases", type=int, default=4, help="scenes on which the deliberate biases are measured")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder of render.json")
     given = parser.parse_args()
