@@ -87,12 +87,16 @@ def compute(
     numbers |= {f"{region}_mean_sigma_rel": part["mean_rel"]["total"] for region, part in fall.items()}
     parts = {"sigma": np.sqrt(variance), **{name: np.sqrt(part) for name, part in own.items()}}
     parts["of_means"] = np.sqrt(pixels.of_means(shown, sampled))
-    for mode in modes:
-        parts[f"mode_{mode.name}"] = np.zeros(picture.shape, np.float32)
-        parts[f"mode_{mode.name}"][window] = mode.change
-    channels = {name: v for layer, rgb in parts.items() for name, v in Raster.split(rgb, layer).items()}
+    level = float(np.median(plate.rgb()))
+    channels: dict[str, np.ndarray] = {}
+    for layer, rgb in parts.items():
+        channels |= pixels.stored(Raster.split(rgb, layer), level)
+    for mode in modes:  # one at a time: of 24 million pixels each is 288 MB before it is stored
+        whole = np.zeros(picture.shape, np.float32)
+        whole[window] = mode.change
+        channels |= pixels.stored(Raster.split(whole, f"mode_{mode.name}"), level)
     header = {"insitu:modes": ",".join(mode.name for mode in modes), "insitu:sigma": SIGMA}
-    raster = Raster(pixels.stored(channels, float(np.median(plate.rgb()))), ACESCG, header)
+    raster = Raster(channels, ACESCG, header)
     uncovered = not_covered(records)
     warnings = [f"uncertainty: {unknown} px have none, as the plate is clipped there"] if unknown else []
     warnings += [f"{one.name} is a lower bound: no sigma covers what it lacks" for one in emitters if one.lower_bound]
@@ -212,7 +216,7 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
             share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
             change = angle / STEP_RAD * response.of_turn(apart, share)
-        modes.append(pixels.Mode(pattern.name, pattern.source, change))
+        modes.append(pixels.Mode(pattern.name, pattern.source, change.astype(np.float32)))
     return modes
 
 
@@ -241,7 +245,7 @@ def geometry_modes(studio: Studio, composite: Raster, plate: Raster, share: floa
         by_object, by_ground = geometry.shifts(field, grid.shape, window)
         change = geometry.moved_by(obj, by_object) - ground * geometry.moved_by(alpha, by_object)
         change += ground * geometry.moved_by(shade, by_ground) + geometry.moved_by(add, by_ground)
-        modes.append(pixels.Mode(f"pose_{number}", "pose", change))
+        modes.append(pixels.Mode(f"pose_{number}", "pose", change.astype(np.float32)))
     return modes
 
 

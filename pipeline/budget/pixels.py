@@ -43,7 +43,7 @@ def render_variance(
     Noise (H, W) is RMS over the channels; it is shared out as the layers' own channels are. ``on_change``: what the
     composite makes of a unit of changed light.
     """
-    parts = np.zeros(obj.shape)
+    parts = np.zeros(obj.shape, np.float32)
     for factor, level, noise in ((on_change, without, noise_change), (1.0, obj, noise_obj)):
         rms = np.sqrt(np.mean(np.square(level), -1, keepdims=True))
         hue = np.divide(np.abs(level), rms, out=np.ones(level.shape), where=rms > 0)
