@@ -71,6 +71,13 @@ def exif_camera(frame: Frame, lens_name: str = "") -> tuple[Camera, dict[str, An
     return camera, numbers, warnings, evidence
 
 
+def equivalent_focal_px(frame: Frame) -> float | None:
+    """Focal length [px] of the 35 mm equivalent in EXIF, by the diagonal (CIPA DCG-001); None without one."""
+    if frame.focal_35mm <= 0:
+        return None
+    return float(frame.focal_35mm / FULL_FRAME_DIAGONAL_MM * np.hypot(frame.width, frame.height))
+
+
 def _focal_px(frame: Frame) -> tuple[float, float, str]:
     """Focal length [px], its relative standard uncertainty, and where it comes from."""
     diagonal = float(np.hypot(frame.width, frame.height))
@@ -78,7 +85,7 @@ def _focal_px(frame: Frame) -> tuple[float, float, str]:
     native = any(abs(shape / usual - 1) < SHAPE_TOLERANCE for usual in NATIVE_SHAPES)
     sensor = sensor_diagonal_mm(frame.camera) if frame.focal_mm > 0 else None
     by_label = frame.focal_mm / sensor * diagonal if sensor else None
-    by_equivalent = frame.focal_35mm / FULL_FRAME_DIAGONAL_MM * diagonal if frame.focal_35mm > 0 else None
+    by_equivalent = equivalent_focal_px(frame)
     if by_label is not None and (by_equivalent is None or abs(by_label / by_equivalent - 1) < DISAGREEMENT):
         sigma = LABEL_SIGMA if native else EQUIVALENT_SIGMA
         return by_label, sigma, f"{frame.focal_mm:g} mm on the {sensor:.1f} mm diagonal of {frame.camera}"

@@ -14,13 +14,13 @@ import numpy as np
 
 from pipeline.camera.adjustment import free_columns, lens_vector, with_lens
 from pipeline.camera.bundle import Adjusted, Bundle, Corners, adjust
+from pipeline.camera.exif_camera import equivalent_focal_px
 from pipeline.camera.lens import pixel_rays
 from pipeline.camera.rigid import umeyama
 from pipeline.conventions import transform_points
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera, Frame, Reconstruction
 
-FILM_MM = 36.0  # width that "35 mm equivalent" focal lengths mean; makers also use the diagonal, which differs by 3 %
 USUAL_FOCAL = 1.2  # of the long side, without any hint
 FOCAL_SIGMA, CENTRE_SIGMA = 0.25, 0.02  # of the start; the principal point in units of the long side
 NEEDED_DEVIANCE = 9.0  # per parameter that buys a term of the lens: three standard errors
@@ -42,7 +42,7 @@ class Seen:
 def camera_start(frame: Frame) -> Camera:
     """A start for a lens that nothing is known of but what EXIF says of its focal length."""
     long = max(frame.width, frame.height)
-    focal = frame.focal_35mm / FILM_MM * long if frame.focal_35mm > 0 else USUAL_FOCAL * long
+    focal = equivalent_focal_px(frame) or USUAL_FOCAL * long
     return Camera(
         width=frame.width, height=frame.height, fx=focal, fy=focal, cx=frame.width / 2, cy=frame.height / 2,
         source="exif" if frame.focal_35mm > 0 else "guess",
