@@ -45,6 +45,12 @@ def courtyard_build(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def lacquer_build(tmp_path_factory) -> Path:
+    """Build folder of ``insitu run sample_captures/lacquer --quality draft``; read it, never write into it."""
+    return draft_of("lacquer", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
 def desk_shuffled(tmp_path_factory) -> tuple[Path, dict[str, str]]:
     """The photographs of desk in one folder under names that tell nothing; and the names they had."""
     folder = tmp_path_factory.mktemp("card")
