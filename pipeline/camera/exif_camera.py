@@ -37,8 +37,8 @@ def exif_camera(frame: Frame, lens_name: str = "") -> tuple[Camera, dict[str, An
     name = frame.lens or lens_name
     if is_fisheye(frame.camera, name, frame.focal_mm):
         raise CaptureError(
-            f"{frame.file}: its lens {name!r} is a fisheye, needed a rectilinear one, as EXIF does not say how it bends; "
-            "photograph a board for [camera] calibration"
+            f"{frame.file}: its lens {name!r} is a fisheye, needed a rectilinear one, as EXIF does not say how it "
+            "bends; photograph a board for [camera] calibration"
         )
     focal, sigma, because = _focal_px(frame)
     bend, corner, said = _distortion(frame, name, focal)
