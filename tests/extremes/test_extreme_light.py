@@ -159,10 +159,17 @@ def test_unwrapping_keeps_the_energy_of_a_lamp(seed, ratio, radius_px, height, s
 
 
 @settings(max_examples=10)
-@given(seed=seeds, ratio=ratios, radius_px=st.integers(20, 60), height=st.integers(16, 48))
+@given(seed=seeds, ratio=ratios, radius_px=st.integers(40, 99), height=st.integers(16, 48))
+def test_unwrapping_a_middling_ball(seed, ratio, radius_px, height, saw):
+    saw("law.energy_unwrap_middle", "exact", unwrapped_energy(seed, ratio, radius_px, height))
+
+
+@settings(max_examples=10)
+@given(seed=seeds, ratio=ratios, radius_px=st.integers(20, 39), height=st.integers(16, 48))
 def test_unwrapping_a_small_ball(seed, ratio, radius_px, height, saw):
+    """`finding.complaints` says of such balls that their directions are coarse: ``ball.small``."""
     error = unwrapped_energy(seed, ratio, radius_px, height)
-    saw("law.energy_unwrap_small", "degraded", error, said="balls below 40 px are said to be coarse")
+    saw("law.energy_unwrap_small", "degraded", error, said="directions are coarse")
 
 
 @given(sine=st.floats(0, 1), ratio=st.floats(1e-9, 0.99))
