@@ -1,6 +1,6 @@
 """Where the camera was: ``make bench-pose`` writes docs/benchmarks/pose.json, pose.md and pose.svg.
 
-    python -m benchmarks.pose [--parts coverage,boards,markers,real] [--out docs/benchmarks]
+    python -m benchmarks.pose [--parts boards,real,coverage,markers] [--out docs/benchmarks]
 
 Simulated corners and tracks for every route; rendered boards and markers through the detector; real photographs.
 """
@@ -21,10 +21,10 @@ from benchmarks.measures import cpu_seconds
 from benchmarks.pose_page import write_page
 
 PARTS: dict[str, Callable[[Path], Any]] = {
-    "coverage": lambda folder: pose_coverage.all_routes(),
     "boards": lambda folder: pose_boards.boards(),
-    "markers": lambda folder: pose_boards.markers(),
     "real": pose_real.real,
+    "coverage": lambda folder: pose_coverage.all_routes(),
+    "markers": lambda folder: pose_boards.markers(),
 }
 
 
@@ -37,7 +37,7 @@ def figures(record: dict[str, Any]) -> dict[str, Any]:
         "pos_rel_30": true["pos_rel"]["median"], "pos_rel_30_calibrated": calibrated["pos_rel"]["median"],
         "coverage95": {route: found["held_95"] for route, found in record["coverage"].items()},
         "normal_deg": calibrated["normal_deg"]["worst"], "contact_px": calibrated["contact_px"]["worst"],
-        "herzjesu_centre_mm": herzjesu.get("centre_mm"), "herzjesu_rot_deg": herzjesu.get("rot_deg"),
+        "herzjesu_centre_mm": herzjesu.get("centre_mm_by_centres"), "herzjesu_rot_deg": herzjesu.get("rot_deg"),
         "abakisita_rel_median": real["abakisita"].get("rel_median"),
         "kitchen_rot_deg": kitchen.get("rot_deg"), "kitchen_pos_rel": kitchen.get("pos_rel"),
     }  # fmt: skip
@@ -46,10 +46,14 @@ def figures(record: dict[str, Any]) -> dict[str, Any]:
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--parts", default=",".join(PARTS), help="which, with commas; the others are kept as they were")
+    parser.add_argument(
+        "--parts",
+        default=",".join(PARTS),
+        help="which, with commas; the others are kept as they were, of none only the page is written",
+    )
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"), help="folder")
     given = parser.parse_args()
-    file, wanted = given.out / "pose.json", given.parts.split(",")
+    file, wanted = given.out / "pose.json", [name for name in given.parts.split(",") if name]
     record = {} if set(wanted) == set(PARTS) else json.loads(file.read_text())
     seconds = dict(record.get("cpu_seconds", {}))
     record = {name: record[name] for name in PARTS if name in record}

@@ -37,8 +37,8 @@ BLURS_PX = (0.5, 1.1)
 BOARD_M, CENTRE = 0.21, np.array([0.105, 0, 0.075])
 FOOT = np.array([0.105, 0, 0.19])  # of an object: 4 cm in front of the board's edge
 TILT_DEG, LEAST_PX, WIDEST_PX = 30.0, 480.0, 560.0
-LENSES, PER_LENS, PHOTOS = 20, 11, 10
-SIZES_PX, TILTS_DEG, REPEATS = (24, 32, 48, 72, 110, 170, 260), (5, 15, 30, 50, 65), 12
+LENSES, PER_LENS, PHOTOS = 8, 26, 10
+SIZES_PX, TILTS_DEG, REPEATS = (24, 32, 48, 72, 110, 170, 260), (5, 15, 30, 50, 65), 6
 FLIPPED_DEG = 10.0
 SIGMA_PX, LEAST_RATIO = knobs.Pose().corner_sigma_px, knobs.Pose().min_ambiguity
 
