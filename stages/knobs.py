@@ -157,7 +157,7 @@ KNOBS: dict[str, type[Params]] = {
     "render": Render, "composite": Composite, "uncertainty": Uncertainty, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip
 
-# What each preset changes from the defaults above.
+# What each preset changes from the defaults above: points of the front of the run that docs/trade/desk.json names.
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "draft": {
         "merge": {"weights": "poisson"}, "develop": {"demosaic": "bilinear"}, "probe": {"width": 512, "supersample": 2},
