@@ -161,7 +161,7 @@ def test_where_the_model_ends() -> None:
     ids=["rational", "fisheye"],
 )  # fmt: skip
 def test_maps_of_wide_lenses_come_back(distortion: list[float]) -> None:
-    """Bilinear reading of float32 maps, as a warp does: required 0.01 px, measured 0.0007. 86 degrees across the diagonal."""
+    """Float32 maps read as a warp does: required 0.01 px, measured 0.0007. 107 degrees from corner to corner."""
     size = 4 + len(distortion)
     camera = Camera(
         width=320, height=240, fx=215.0, fy=214.0, cx=161.0, cy=119.0, distortion=np.array(distortion),
