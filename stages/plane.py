@@ -21,6 +21,7 @@ from pipeline.camera.cloud_plane import AGREE_CHI2, CloudPlane, plane_of_cloud
 from pipeline.camera.lens import project, project_jacobians
 from pipeline.camera.planes_in_cloud import flat_surfaces
 from pipeline.camera.rigid import camera_points
+from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.run.artifacts import (
     CAMERA,
     CLOUD,
@@ -33,7 +34,7 @@ from pipeline.run.artifacts import (
     VIEWS,
     WISHES,
 )
-from pipeline.run.errors import CaptureError, ManifestError
+from pipeline.run.errors import CaptureError
 from pipeline.run.stage import Stage
 from pipeline.transport.beside import as_proxy, weighed
 from pipeline.transport.extent import FAR_SEEN, Standing, beyond, needed, standing
@@ -45,7 +46,6 @@ EDGE_ON_DEG, GRAZING_DEG = 1.0, 5.0  # elevation of the camera over the plane, s
 NEAREST_DEPTH = (
     0.1  # of the depth of the nearest thing that stands: the rectangle ends there, before the camera's plane
 )
-FAR_OUTSIDE = 2.0  # frame diagonals beyond the frame, where not even a shadow returns
 BISECTIONS = 50  # to rounding
 BARE = 8.0  # sizes around a marker where no object stands
 UP = np.array([0.0, 1.0, 0.0])
@@ -57,14 +57,8 @@ def compute(
 ) -> Result:  # fmt: skip
     """Plane ``y = 0`` of the world with covariance, the modelled rectangle, and the contact uncertainty in pixels."""
     view = views["plate"]
-    height = float(view.world_from_camera[1, 3])
-    if not height > 0:
-        raise CaptureError(
-            f"plate: the camera is {-height:.3g} m below the marker's plane, needed above; is the board described as "
-            "printed (legacy, squares), or a given pose in the wrong frame?"
-        )
-    feet = {wish["name"]: np.array([wish["position_m"][0], 0.0, wish["position_m"][1]])
-            for wish in wishes.get("object", [])}  # fmt: skip
+    height = height_above(view)
+    feet = feet_of(wishes)
     warnings = check_feet(feet, camera, view)
     marked, size = marker_rectangle(facts, height)
     ground = np.array([*marked, *feet.values()]) if feet or len(marked) else np.zeros((1, 3))
@@ -201,29 +195,6 @@ def marker_rectangle(facts: dict[str, Any], camera_height_m: float) -> tuple[np.
         half = facts["marker"][0]["side_m"] / 2
         return np.array([[-half, 0, -half], [half, 0, half]]), float(2 * half)
     return np.empty((0, 3)), 0.1 * camera_height_m
-
-
-def check_feet(feet: dict[str, np.ndarray], camera: Camera, view: View) -> list[str]:
-    """Refuse objects that the plate cannot show; warn about feet outside the frame."""
-    problems, warnings = [], []
-    frame = np.array([camera.width, camera.height])
-    for name, foot in feet.items():
-        x, y, z = camera_points(view.world_from_camera, foot[None])[0][0]
-        where = f"object {name}: position_m is ({foot[0]:g}, {foot[2]:g})"
-        if z <= 0:
-            problems.append(f"{where}, which is behind the plate camera; expected a place in front of it")
-            continue
-        px = np.array(
-            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
-        )  # without the lens's bend: far out
-        outside = float(np.linalg.norm(np.maximum(np.maximum(-px, px - frame), 0)))
-        if outside > FAR_OUTSIDE * np.hypot(*frame):
-            problems.append(f"{where}, {outside:.0f} px outside the plate; expected a place that it shows, or near it")
-        elif outside > 0:
-            warnings.append(f"{where}: its foot is {outside:.0f} px outside the plate")
-    if problems:
-        raise ManifestError(*problems)
-    return warnings
 
 
 def elevation_deg(view: View, spots: list[np.ndarray]) -> float:

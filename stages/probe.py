@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, smooth
@@ -32,6 +33,8 @@ def compute(
     balance: dict[str, Balance], wishes: dict[str, Any], params: knobs.Probe,
 ) -> Result:  # fmt: skip
     """Fitted balls, and the light at the probe (H, W) with H = width / 2, world frame."""
+    height_above(views["plate"])  # what the plate cannot show is refused before the light is looked for
+    check_feet(feet_of(wishes), camera, views["plate"])
     photographs = balanced(photographs, balance)
     grid = Grid(params.width, params.supersample, params.rim)
     shots = Shots(facts, photographs, camera, views)

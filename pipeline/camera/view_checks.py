@@ -1,15 +1,19 @@
-"""Whether photographs taken together are what is needed: one lens for all by their metadata, and places that differ."""
+"""Whether photographs are what is needed: one lens for all by their metadata, places that differ, objects in view."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from pipeline.types import Frame, Reconstruction
+from pipeline.camera.rigid import camera_points
+from pipeline.run.errors import CaptureError, ManifestError
+from pipeline.types import Camera, Frame, Reconstruction, View
 
 SAME_FOCAL = 0.02  # as metadata round it
+FAR_OUTSIDE = 2.0  # frame diagonals beyond the frame, where not even a shadow returns
 LEAST_PARALLAX_DEG = 1.0  # median over the points: below it their depth, and so the camera's way, is mostly noise
 
 
@@ -62,3 +66,44 @@ def only_turned(made: Reconstruction) -> str:
         f"sfm: sight lines to a point differ by {angle:.2g} degrees (median), needed {LEAST_PARALLAX_DEG:g}: the "
         "camera was turned on the spot; step aside between photographs"
     )
+
+
+def height_above(view: View) -> float:
+    """Height [m] of the plate's camera above the plane. Raises CaptureError when it is below."""
+    height = float(view.world_from_camera[1, 3])
+    if not height > 0:
+        raise CaptureError(
+            f"plate: the camera is {-height:.3g} m below the marker's plane, needed above; is the board described as "
+            "printed (legacy, squares), or a given pose in the wrong frame?"
+        )
+    return height
+
+
+def feet_of(wishes: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Where each object is to stand (3,) [m] on the plane, world frame."""
+    return {
+        wish["name"]: np.array([wish["position_m"][0], 0.0, wish["position_m"][1]]) for wish in wishes.get("object", [])
+    }
+
+
+def check_feet(feet: dict[str, np.ndarray], camera: Camera, view: View) -> list[str]:
+    """Warnings about feet (3,) outside the frame. Raises ManifestError for objects that the plate cannot show."""
+    problems, warnings = [], []
+    frame = np.array([camera.width, camera.height])
+    for name, foot in feet.items():
+        x, y, z = camera_points(view.world_from_camera, foot[None])[0][0]
+        where = f"object {name}: position_m is ({foot[0]:g}, {foot[2]:g})"
+        if z <= 0:
+            problems.append(f"{where}, which is behind the plate camera; expected a place in front of it")
+            continue
+        px = np.array(
+            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
+        )  # without the lens's bend: far out
+        outside = float(np.linalg.norm(np.maximum(np.maximum(-px, px - frame), 0)))
+        if outside > FAR_OUTSIDE * np.hypot(*frame):
+            problems.append(f"{where}, {outside:.0f} px outside the plate; expected a place that it shows, or near it")
+        elif outside > 0:
+            warnings.append(f"{where}: its foot is {outside:.0f} px outside the plate")
+    if problems:
+        raise ManifestError(*problems)
+    return warnings
