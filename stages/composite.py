@@ -228,10 +228,11 @@ def compute(
         "display": display_transform(picture, *looking),
         "plate_display": display_transform(plate.rgb(), *looking),
     }
-    return Result(outputs, numbers, warnings_of(numbers, numbers["touched_fraction"] * picture[..., 0].size))
+    touched_px = numbers["touched_fraction"] * picture[..., 0].size
+    return Result(outputs, numbers, warnings_of(numbers, touched_px, params.kind))
 
 
-def warnings_of(numbers: dict[str, Any], touched_px: float) -> list[str]:
+def warnings_of(numbers: dict[str, Any], touched_px: float, kind: str) -> list[str]:
     """What of the counters a user has to know, and can do."""
     found = []
     if count := numbers["guard_clipped_plate_px"]:
@@ -240,7 +241,8 @@ def warnings_of(numbers: dict[str, Any], touched_px: float) -> list[str]:
             "add a shorter plate frame"
         )
     if count := numbers["guard_negative_px"]:
-        found.append(f"composite: {count} px are below zero; kind = auto avoids that")
+        cure = "more render.samples lessen that" if kind == "auto" else "kind = auto avoids most of that"
+        found.append(f"composite: {count} px are below zero; {cure}")
     if count := numbers["guard_edge_of_model_px"]:
         found.append(
             f"composite: a visible change ends at the border of the modelled local scene on {count} px; lower "
