@@ -307,7 +307,7 @@ def test_clipped_lamp_is_a_lower_bound(shots, monkeypatch):
 
 def test_room_moves_the_map_to_the_objects(shots, result, again):
     box = {"centre_m": [0.1, 0.8, 0.0], "size_m": [2.2, 2.4, 2.0], "yaw_deg": 15.0}
-    wishes = {"object": [{"position_m": [0.3, 0.1]}]}
+    wishes = {"object": [{"name": "cube", "position_m": [0.3, 0.1]}]}
     photographs = {name: shots["photographs"][name] for name in ("plate", "ball_a", "ball_b")}
 
     def moved(budget: float, room: dict[str, Any]):

@@ -260,7 +260,8 @@ def left_lines(proposal: Proposal, known: Sequence[str]) -> list[str]:
 def filled(data: Any, number: float = 0.05) -> Any:
     """A parsed manifest with a number in place of every TODO, so that all the rest can be validated."""
     if isinstance(data, dict):
-        return {key: filled(value, number) for key, value in data.items()}
+        smaller = {"marker_m": 0.7}  # than its square
+        return {key: filled(value, smaller.get(key, 1.0) * number) for key, value in data.items()}
     if isinstance(data, list):
         return [filled(value, number) if isinstance(value, dict | list) else value for value in data]
     return number if isinstance(data, str) and data.startswith(TODO) else data
