@@ -115,12 +115,16 @@ def compute(
                 estimates[name] = estimate
             views[name] = view_of(estimate) if isinstance(estimate, Estimate) else estimate
     shifts = settle_tripod(tripod, sights, estimates, views, camera, params.corner_sigma_px, warnings)
+    shifts |= places.pop("tripod_shift_px", {})
+    turns = without_marks([name for name in tripod if name not in shifts], views, photographs, camera, warnings)
     numbers = {
         name: figures(name, view, estimates.get(name), sights.get(name), warnings) for name, view in views.items()
     }
     warnings += board_doubts.of_prints(facts, views, sights, grey(photographs["plate"].rgb()), cameras["plate"])
-    for name, shift in {**shifts, **places.pop("tripod_shift_px", {})}.items():
+    for name, shift in shifts.items():
         numbers[name]["tripod_shift_px"] = shift
+    for name, turn in turns.items():
+        numbers[name]["registration"] = turn
     numbers["plate"] |= bare
     numbers |= {key: part for key, part in (("sfm", extra), ("marker_map", places)) if part}
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
@@ -137,6 +141,29 @@ def bare_plate(
         raise NumericalError(f"plate: shows no board, and beside {shows} {error}") from error
     warnings += turn_said(shows, found)
     return turned(view, found), {"registered_to": shows, "registration": found.evidence}
+
+
+def without_marks(
+    names: list[str], views: dict[str, View], photographs: dict[str, Raster], camera: Camera, warnings: list[str]
+) -> dict[str, Any]:
+    """Tripod views in which no board says whether they stayed are compared with the plate; the turned are turned.
+
+    Returns each one's registration, or why there is none: then it keeps the plate's pose, which nothing checked.
+    """
+    figures: dict[str, Any] = {}
+    for name in names:
+        if views[name].route != "same_as":
+            continue
+        try:
+            found = registered(grey(photographs[name].rgb()), grey(photographs["plate"].rgb()), camera)
+        except NumericalError as error:
+            figures[name] = {"not_checked": str(error)}
+            continue
+        figures[name] = found.evidence
+        if found.evidence["chi2"] > MOVED_CHI2:
+            views[name] = turned(views["plate"], found)
+            warnings.append(moved_by(name, "the picture", found.evidence["shift_px"], found.evidence["chi2"]))
+    return figures
 
 
 def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:

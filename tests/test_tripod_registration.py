@@ -97,3 +97,28 @@ def test_a_bare_plate_is_placed_by_the_tripod(px: float) -> None:
     assert numbers["registration"]["shift_px"] == pytest.approx(np.hypot(0.6, 0.8) * px, abs=0.15 * px + 0.05)
     said = [text for text in result.warnings if "the camera turned by" in text]
     assert len(said) == (1 if px > 1 else 0)
+
+
+@pytest.mark.parametrize("px", [0.0, 3.0])
+def test_a_ball_that_hides_the_board_is_checked_by_the_picture(px: float) -> None:
+    """The plate shows the board, the ball's photograph does not: what else both show says whether the tripod stayed."""
+    turn = np.array([0.6, -0.8, 0.2]) * px / 640
+    scene = far_scene(3)
+    board = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3)
+    there = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3, black=1, white=1, table=0)
+    plate = there * board + (1 - there) * shot(scene, np.zeros(3), 0.01, 1)
+    pictures = {"plate": plate, "ball": with_ball(shot(scene, turn, 0.01, 2))}
+    photographs = {
+        name: Raster(dict.fromkeys("RGB", np.asarray(one, np.float32)), "acescg") for name, one in pictures.items()
+    }
+    facts = {"board": BOARD, "marker": [], "capture_root": ".", "ball": [{"name": "ball", "tripod": True}], "pose": []}
+    result = pose.compute(facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose())
+    plate_view, ball_view = result.outputs["views"]["plate"], result.outputs["views"]["ball"]
+    assert plate_view.route == "charuco"
+    assert ball_view.route == ("tripod" if px else "same_as")
+    truth = plate_view.world_from_camera.copy()
+    truth[:3, :3] = truth[:3, :3] @ rotation_exp(turn).T
+    off = difference(ball_view.world_from_camera, truth)[:3]
+    assert np.linalg.norm(off) * CAMERA.fx < 0.1  # px; the registration is good to 0.02 across, worse about the axis
+    assert len([text for text in result.warnings if "the picture shifted by" in text]) == (px > 0)
+    assert result.numbers["ball"]["registration"]["shift_px"] == pytest.approx(px, abs=0.15 * px + 0.05)

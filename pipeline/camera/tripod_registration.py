@@ -179,7 +179,7 @@ def lender(sights: dict[str, Sightings], tripod: list[str], fewest: int) -> str:
 
 
 def turned(view: View, found: Registration) -> View:
-    """The plate's pose from that of the other view, the registration's covariance added to its own.
+    """The pose of the registration's first picture (the plate) from the ``view`` of its second, covariances added.
 
     Its route is "tripod". Position and lens are the other's: a tripod only turns.
     """
