@@ -391,6 +391,7 @@ def test_verify_and_summary(desk_build, capsys):
     assert main(["summary", str(DESK), "--out", str(desk_build)]) == 0
     text = capsys.readouterr().out
     assert "doing nothing" in text
+    assert re.search(r"\nobject, relative \(rms\) +0\.\d{4} +0\.\d{4}\n", text)
     assert all(f"\n{name} " in text for name in NAMES)
 
 

@@ -72,7 +72,7 @@ def unfinished(build: Build) -> list[str]:
 
 
 def print_summary(build: Build) -> str:
-    """Paths, what was interrupted, errors beside doing nothing, and seconds per stage."""
+    """Paths, what was interrupted, errors beside doing nothing, stated uncertainty, and seconds per stage."""
     from pipeline.run.artifacts import COMPOSITE, DISPLAY, METRICS, REPORT
 
     lines = ["", f"quality  {build.settings.quality}"]
@@ -89,6 +89,12 @@ def print_summary(build: Build) -> str:
         lines.append(f"{'untouched pixels identical':<38} {metrics.get('untouched_identical')!s:>9}")
     elif build.record("evaluate"):
         lines += ["", "no truth is given: the report's self-check predicts what really stood there"]
+    stated = (build.record("uncertainty") or {}).get("numbers", {})
+    if "object_sigma_rel" in stated:
+        lines += ["", f"{'stated uncertainty, one sigma':<38} {'a pixel':>9} {'region mean':>14}"]
+        for part in ("object", "shadow"):
+            pixel, mean = stated.get(f"{part}_sigma_rel"), stated.get(f"{part}_mean_sigma_rel")
+            lines.append(f"{part + ', relative (rms)':<38} {_figure(pixel):>9} {_figure(mean):>14}")
     records = [(stage.name, build.record(stage.name)) for stage in build.graph.stages]
     done = [(name, record) for name, record in records if record]
     lines += ["", f"{'stage':<12} {'wall s':>8} {'CPU s':>8}"]
