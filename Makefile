@@ -73,8 +73,8 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
-HARD := courtyard lacquer
-figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the captures that are hard in one way (minutes)
+HARD := counter courtyard lacquer
+figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the other bundled captures (minutes)
 	@for c in $(HARD); do for q in preview draft; do \
 		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; \
 		$(INSITU) evaluate sample_captures/$$c --out build/figures/$${c}_preview --with-truth probe,pose,camera,albedo; done
