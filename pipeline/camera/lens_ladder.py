@@ -27,7 +27,7 @@ WIDE_LADDER: tuple[tuple[str, ...], ...] = (("k1", "k2", "k3", "k4", "k5", "k6")
 EQUIDISTANT = np.array([4 / 15, 0, 0, 0, 0, 9 / 15, 0, 0])  # atan(r) / r as a ratio of polynomials (Pade)
 ROUGH_PX = 0.3  # of a corner: beyond it another lens is tried
 FISHEYE_LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("k3", "k4"))
-RATIONAL = LADDER[-1]  # the denominator: nothing to divide where nothing bends
+RATIONAL = LADDER[-1]  # the denominator: nothing to divide where k1 alone explains the bend
 FEWEST_PHOTOS = 3
 SAME_FOCAL = 0.01
 NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
@@ -260,7 +260,7 @@ def climb(start: Camera, poses: list[np.ndarray], photos: Photos, ladder: tuple[
     for _ in range(2):  # a term may pay only once a later one is in
         before = terms
         for step in ladder:
-            if set(step) <= set(terms) or (step == RATIONAL and "k1" not in terms):
+            if set(step) <= set(terms) or (step == RATIONAL and not {"k2", "k3"} & set(terms)):
                 continue
             error = held_out(start, poses, photos, terms + step)
             gain, consistency = improvement(best, error, corners)
