@@ -8,7 +8,6 @@ given as masks take their share back. Every guard that fires is counted and mark
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ from pipeline.image.display import display_exposure, display_transform
 from pipeline.light.environment import irradiance
 from pipeline.light.prediction import plane_hits, plane_texture
 from pipeline.run import artifacts as A
-from pipeline.run.errors import ArtifactError, CaptureError
-from pipeline.run.formats import read_mask
+from pipeline.run.errors import ArtifactError
+from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
 from pipeline.types import Camera, Emitter, Occluder, Plane, Raster, Result, View
@@ -89,18 +88,7 @@ def in_front(occluders: list[Occluder], shape: tuple[int, int]) -> np.ndarray | 
     Raises CaptureError when a mask cannot be read or has another size than the plate.
     """
     free: np.ndarray | None = None
-    for occluder in occluders:
-        if occluder.mask_file is None:
-            continue
-        try:
-            mask = read_mask(Path(occluder.mask_file))
-        except ArtifactError as error:
-            raise CaptureError(f"occluder {occluder.name}: {error}") from error
-        if mask.shape != shape:
-            raise CaptureError(
-                f"occluder {occluder.name}: {occluder.mask_file} is {mask.shape[1]} x {mask.shape[0]} pixels; expected "
-                f"{shape[1]} x {shape[0]}, the plate's; export it at that size"
-            )
+    for mask in masks_of(occluders, shape):
         free = (1 - mask) if free is None else free * (1 - mask)
     return None if free is None else 1 - free
 

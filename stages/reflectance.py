@@ -12,7 +12,6 @@ found stays in the albedo, and the ratio composite undoes it again.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ import numpy as np
 from pipeline.conventions import ACESCG, CLIPPED
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
-from pipeline.run.errors import ArtifactError, CaptureError, NumericalError
-from pipeline.run.formats import read_mask
+from pipeline.run.errors import NumericalError
+from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport.gradient import Fit, fit
 from pipeline.transport.patches import enlarged
@@ -147,18 +146,7 @@ def unhidden(plate: Raster, occluders: list[Occluder]) -> Raster:
     Raises CaptureError when a mask cannot be read or has another size.
     """
     hidden = np.zeros(plate.shape, bool)
-    for occluder in occluders:
-        if occluder.mask_file is None:
-            continue
-        try:
-            mask = read_mask(Path(occluder.mask_file))
-        except ArtifactError as error:
-            raise CaptureError(f"occluder {occluder.name}: {error}") from error
-        if mask.shape != plate.shape:
-            raise CaptureError(
-                f"occluder {occluder.name}: {occluder.mask_file} is {mask.shape[1]} x {mask.shape[0]} pixels; expected "
-                f"{plate.shape[1]} x {plate.shape[0]}; draw it on the developed plate"
-            )
+    for mask in masks_of(occluders, plate.shape):
         hidden |= mask > 0
     if not hidden.any():
         return plate

@@ -10,7 +10,6 @@ objects is taken as wished; what no stage states an uncertainty for is named in 
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from pipeline.budget.response import DIMMER, STEP_RAD, Grid, Layers, Response, S
 from pipeline.conventions import ACESCG
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
-from pipeline.run.formats import read_mask
+from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
 from pipeline.transport.placing import place_objects
@@ -158,9 +157,8 @@ def settings(records: dict[str, Any], stage: str, knob: str, otherwise: Any) -> 
 def in_sight(occluders: list[Occluder], shape: tuple[int, int]) -> np.ndarray:
     """(H, W) share of each pixel that no masked real thing covers, as in composite."""
     free = np.ones(shape)
-    for occluder in occluders:
-        if occluder.mask_file is not None:
-            free *= 1 - read_mask(Path(occluder.mask_file))
+    for mask in masks_of(occluders, shape):
+        free *= 1 - mask
     return free
 
 
