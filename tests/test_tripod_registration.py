@@ -10,7 +10,7 @@ from pipeline.camera.lens import pixel_rays
 from pipeline.camera.rigid import difference, rotation_exp
 from pipeline.camera.tripod_registration import registered
 from pipeline.run.errors import NumericalError
-from pipeline.types import Camera, Raster, Reconstruction
+from pipeline.types import Camera, Raster, Reconstruction, Result
 from stages import knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1, distortion=np.array([-0.1, 0.02, 0, 0, 0]))
@@ -48,6 +48,23 @@ def with_ball(picture: np.ndarray) -> np.ndarray:
     return np.where(np.hypot(x - 220, y - 180) < 60, 0.4 + 0.3 * np.sin(x / 9), shaded)
 
 
+def on_board(picture: np.ndarray) -> np.ndarray:
+    """The board lying before the scene."""
+    board = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3)
+    there = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3, black=1, white=1, table=0)
+    return there * board + (1 - there) * picture
+
+
+def posed(plate: np.ndarray, ball: np.ndarray) -> Result:
+    """Stage pose on a plate and a ball from one tripod."""
+    photographs = {
+        name: Raster(dict.fromkeys("RGB", np.asarray(one, np.float32)), "acescg")
+        for name, one in {"plate": plate, "ball": ball}.items()
+    }
+    facts = {"board": BOARD, "marker": [], "capture_root": ".", "ball": [{"name": "ball", "tripod": True}], "pose": []}
+    return pose.compute(facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose())
+
+
 def test_turn_and_its_covariance() -> None:
     """Six tripods, still or knocked by up to a few px: 3 degrees of freedom, 99.9 % of each below 16.3."""
     chi2, errors = [], []
@@ -75,15 +92,7 @@ def test_nothing_in_common_is_refused() -> None:
 def test_a_bare_plate_is_placed_by_the_tripod(px: float) -> None:
     turn = np.array([0.6, -0.8, 0.2]) * px / 640
     scene = far_scene(3)
-    board = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3)
-    there = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3, black=1, white=1, table=0)
-    ball = there * board + (1 - there) * shot(scene, turn, 0.01, 1)
-    pictures = {"plate": shot(scene, np.zeros(3), 0.01, 2), "ball": ball}
-    photographs = {
-        name: Raster(dict.fromkeys("RGB", np.asarray(one, np.float32)), "acescg") for name, one in pictures.items()
-    }
-    facts = {"board": BOARD, "marker": [], "capture_root": ".", "ball": [{"name": "ball", "tripod": True}], "pose": []}
-    result = pose.compute(facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose())
+    result = posed(shot(scene, np.zeros(3), 0.01, 2), on_board(shot(scene, turn, 0.01, 1)))
     views = result.outputs["views"]
     truth = BOARD_FROM.copy()
     truth[:3, :3] = truth[:3, :3] @ rotation_exp(turn)
@@ -104,15 +113,7 @@ def test_a_ball_that_hides_the_board_is_checked_by_the_picture(px: float) -> Non
     """The plate shows the board, the ball's photograph does not: what else both show says whether the tripod stayed."""
     turn = np.array([0.6, -0.8, 0.2]) * px / 640
     scene = far_scene(3)
-    board = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3)
-    there = photograph(charuco_print(BOARD), CAMERA, BOARD_FROM, 3, black=1, white=1, table=0)
-    plate = there * board + (1 - there) * shot(scene, np.zeros(3), 0.01, 1)
-    pictures = {"plate": plate, "ball": with_ball(shot(scene, turn, 0.01, 2))}
-    photographs = {
-        name: Raster(dict.fromkeys("RGB", np.asarray(one, np.float32)), "acescg") for name, one in pictures.items()
-    }
-    facts = {"board": BOARD, "marker": [], "capture_root": ".", "ball": [{"name": "ball", "tripod": True}], "pose": []}
-    result = pose.compute(facts, photographs, CAMERA, {}, Reconstruction(), [], knobs.Pose())
+    result = posed(on_board(shot(scene, np.zeros(3), 0.01, 1)), with_ball(shot(scene, turn, 0.01, 2)))
     plate_view, ball_view = result.outputs["views"]["plate"], result.outputs["views"]["ball"]
     assert plate_view.route == "charuco"
     assert ball_view.route == ("tripod" if px else "same_as")
