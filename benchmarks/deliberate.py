@@ -16,7 +16,7 @@ from pipeline.transport.denoise import TILE, tile_means
 from pipeline.transport.difference import difference_block
 from pipeline.transport.estimate import Canvas, Effort, pictures, prepare, sampled
 from pipeline.transport.passes import Halves
-from pipeline.transport.region import limits_for
+from pipeline.transport.region import Region, limits_for
 from pipeline.transport.trace import trace, unchanged_block
 
 SHAPE, FOV_DEG = (96, 144), 80.0
@@ -91,8 +91,9 @@ def planned(case: Case, albedo: np.ndarray, effort: Effort) -> Canvas:
 
 def traced_everywhere(canvas: Canvas) -> Canvas:
     """The canvas without region: every pixel traced, all samples."""
-    whole = np.ones(canvas.shape)
-    region = replace(canvas.region, weight=whole, traced=whole > 0)
+    whole, none = np.ones(canvas.shape), np.zeros((*canvas.shape, 3), np.float32)
+    window = slice(0, canvas.shape[0]), slice(0, canvas.shape[1])
+    region = Region(window, whole, whole > 0, none, none, none)
     return replace(canvas, region=region, effort=replace(canvas.effort, adaptive=False))
 
 
@@ -120,8 +121,10 @@ def finished(canvas: Canvas) -> Halves:
 
 def cut(canvas: Canvas, truth: np.ndarray, noobj: np.ndarray) -> np.ndarray:
     """The true change (H, W, 3) as the region lets it through: left out, faded, or interpolated from the pilot."""
-    smooth = (canvas.region.lost + canvas.region.gained) * noobj
-    return np.where(canvas.region.interpolated[..., None], smooth, truth) * canvas.region.weight[..., None]
+    region, inside = canvas.region, canvas.window
+    smooth = (region.lost + region.gained) * noobj[inside]
+    seen = np.where(region.interpolated[..., None], smooth, truth[inside]) * region.weight[..., None]
+    return canvas.framed(seen)
 
 
 def figures(parts: list[Told]) -> dict[str, float]:

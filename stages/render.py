@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit
 from pipeline.transport.near_one import near_one
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.placing import feet, place_objects
-from pipeline.transport.region import BLUR, limits_for
+from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.trace import LensRays, Rays
 from pipeline.transport.variant import use_mitsuba
@@ -83,7 +84,6 @@ def compute(
     shapes, warnings = place_objects(wishes, plane, float(luminance(upward)) / np.pi, params.materials, pose[:3, 3])
     rays = LensRays(camera, pose)
     plate = photographs["plate"]
-    sigma = np.sqrt(sum(plate[f"variance.{c}"] for c in "RGB") / np.float32(3))
     some = thinned(plate)
     white = 2.0 ** -display_exposure(some.rgb())
     limits = limits_for(some.rgb(), some.rgb("variance"), params.threshold)
@@ -100,8 +100,8 @@ def compute(
     film = film_of(camera, pose, rays)
     apart = strong(emitters, plane, upward)
     worlds = build_worlds(plane, albedo.rgb(), environment.rgb(), shapes, local_proxies, apart, surface, occluders)
-    canvas, left = prepare(worlds, rays, shape, upward, sigma, white, limits, effort, film, tell)
-    if not (canvas.part.weight > 0).any() or not len(canvas.traced):
+    canvas, left = prepare(worlds, rays, shape, upward, Grain(plate), white, limits, effort, film, tell)
+    if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
         "threshold": limits.threshold,
@@ -130,6 +130,17 @@ def strong(emitters: list[Emitter], plane: Plane, light: np.ndarray) -> list[Emi
     """The emitters that give enough of the plane's irradiance ``light`` (3,) to be worth a ray of their own."""
     given = [float((e.irradiance * max(e.direction @ plane.normal, 0.0)).sum()) for e in emitters]
     return [e for e, part in zip(emitters, given, strict=True) if part >= WORTH_A_RAY * light.sum()]
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Noise of the plate (H, W), root mean square of the channels, made where it is asked for."""
+
+    plate: Raster
+
+    def __getitem__(self, window: Window) -> np.ndarray:
+        """(h, w) of a window."""
+        return np.asarray(np.sqrt(sum(self.plate[f"variance.{c}"][window] for c in "RGB") / np.float32(3)))
 
 
 def thinned(picture: Raster) -> Raster:
@@ -246,7 +257,7 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
 
 def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
     """Channels of the size of the plate of pictures of the canvas's window; the feather scales the change."""
-    fade = canvas.part.weight[..., None]
+    fade = canvas.region.weight[..., None]
     lost, gained = images["lost"] * fade, images["gained"] * fade
     layers = {
         "obj": images["obj"],
@@ -259,20 +270,20 @@ def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
     }
     channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(rgb, layer).items()}
     channels |= {"obj.A": images["alpha"], "ground": images["ground"]}
-    channels |= {"noise.change": images["change_noise"] * canvas.part.weight, "noise.obj": images["obj_noise"]}
-    framed = {name: canvas.framed(values) for name, values in channels.items()}
-    return Raster(framed | {"influence": canvas.region.weight}, ACESCG)
+    channels |= {"noise.change": images["change_noise"] * canvas.region.weight, "noise.obj": images["obj_noise"]}
+    channels["influence"] = canvas.region.weight
+    return Raster({name: canvas.framed(values) for name, values in channels.items()}, ACESCG)
 
 
 def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
     """What was sampled, how noisy it is before denoising, and how well the closed form agrees with LS_noobj."""
     samples = halves.both
-    model = samples.albedo * canvas.light_at(canvas.traced) / np.pi
+    model = samples.albedo * canvas.light_traced / np.pi
     bare = (samples.ground > 0.999) & (model > 0).all(1)
     covered = (samples.alpha > 0.99) & (samples.obj > 0).any(1)
     pixels = canvas.shape[0] * canvas.shape[1]
     numbers: dict[str, Any] = {
-        "influenced_fraction": int((canvas.part.weight > 0).sum()) / pixels,
+        "influenced_fraction": int((canvas.region.weight > 0).sum()) / pixels,
         "traced_fraction": len(samples.count) / pixels,
         "object_fraction": int((samples.alpha > 0).sum()) / pixels,
         "not_finite_samples": round(float((samples.not_finite * samples.count).sum())),

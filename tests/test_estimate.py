@@ -93,14 +93,15 @@ def test_adaptive_differs_by_no_more_than_its_numbers_say() -> None:
     samples of either render are allowed.
     """
     canvas, halves, left, limits = adaptive()
-    everything, weight = truth()[2], canvas.region.weight
+    everything, weight = truth()[2], canvas.framed(canvas.region.weight)
     images = {name: canvas.framed(image) for name, image in pictures(canvas, halves)[0].items()}
     used = relative((images["lost"] + images["gained"]) * weight[..., None])
     exact = relative(everything.lost + everything.gained)
     error = np.abs(used - exact).reshape(*wholly(weight > 0).shape, 3).max(-1)
     noise = np.sqrt(everything.change_variance + images["change_variance"].reshape(-1, 3))
     noise = 5 * np.sqrt(relative(noise**2) / (ALBEDO * upward(sky()) / np.pi) / 64).max(-1).reshape(error.shape)
-    outside, traced, interpolated = (wholly(m) for m in (weight == 0, canvas.region.traced, canvas.region.interpolated))
+    masks = [canvas.framed(mask) > 0 for mask in (canvas.region.traced, canvas.region.interpolated)]
+    outside, traced, interpolated = (wholly(mask) for mask in (weight == 0, *masks))
     assert min(part.mean() for part in (outside, traced, interpolated)) > 0.05
     assert np.all(error[outside] < left["left_out_max"] + 5 * left["left_out_noise"] + noise[outside])
     assert left["left_out_max"] < limits.threshold
@@ -162,7 +163,8 @@ def test_the_pilot_grows_where_it_stands_for_pixels() -> None:
     limits, effort = Limits(0.01, 3e-3, 0.01), Effort(samples=64, seed=4)
     first, _ = prepare(worlds, rays, FRAME, upward(sky()), np.full(FRAME, 0.01), 1.0, limits, effort)
     assert first.pilot is not None
-    assert settled(replace(first, pilot=replace(first.pilot, tolerance=1.0)), lambda share: None).region is first.region
+    calm = replace(first, pilot=replace(first.pilot, tolerance=1.0))
+    assert settled(calm, lambda share: None).region is first.region
     first = replace(first, pilot=replace(first.pilot, tolerance=0.0))
     assert first.pilot is not None
     cells = first.pilot.too_noisy(first.region)
@@ -171,7 +173,8 @@ def test_the_pilot_grows_where_it_stands_for_pixels() -> None:
     assert np.array_equal(after.region.lost, again.region.lost)
     assert np.array_equal(after.region.traced, first.region.traced)
     before, now = (
-        canvas.region.variance.reshape(-1, 3)[first.pilot.index[cells]].max(1).mean() for canvas in (first, after)
+        canvas.framed(canvas.region.variance).reshape(-1, 3)[first.pilot.index[cells]].max(1).mean()
+        for canvas in (first, after)
     )
     np.testing.assert_allclose(now / before, 128 / 512, rtol=0.5)
 
@@ -180,8 +183,9 @@ def test_the_regions_border_is_hidden_by_the_photographs_noise() -> None:
     """The composite's step from a tile that is left alone to the next: below a quarter of the noise of its mean."""
     canvas, halves, _, limits = adaptive()
     images = {name: canvas.framed(image) for name, image in pictures(canvas, halves)[0].items()}
-    change = relative((images["lost"] + images["gained"]) * canvas.region.weight[..., None])
-    alone = wholly(canvas.region.weight == 0)
+    weight = canvas.framed(canvas.region.weight)
+    change = relative((images["lost"] + images["gained"]) * weight[..., None])
+    alone = wholly(weight == 0)
     border = binary_dilation(alone) & ~alone
     assert border.sum() > 20
     hidden = SIGMA / CELL / 4

@@ -9,8 +9,10 @@ each other or gloss, E is the path-traced radiance without objects over the albe
 from __future__ import annotations
 
 import functools
+import mmap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -92,16 +94,24 @@ class Effort:
         return 100_003 * self.seed % 2**31
 
 
+class Sigma(Protocol):
+    """Noise of the photograph (H, W), radiance, not finite where unknown; asked for by window."""
+
+    def __getitem__(self, window: Window, /) -> np.ndarray:
+        """(h, w) of a window."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """What is computed where. ``light``: irradiance E, (3,) or per pixel (H W, 3)."""
+    """What is computed where. ``light``: irradiance E, (3,) or per pixel of the window (h w, 3)."""
 
     worlds: Worlds
     rays: Rays | LensRays  # of every pixel
     shape: tuple[int, int]
     region: Region
     light: np.ndarray
-    plate_sigma: np.ndarray  # (H, W) noise of the photograph, radiance; not finite where unknown
+    plate_sigma: Sigma
     white: float  # radiance of display white
     effort: Effort
     film: Film | None = None  # where light tracing is worth its cost
@@ -110,38 +120,34 @@ class Canvas:
     @functools.cached_property
     def traced(self) -> np.ndarray:
         """Flat index of the pixels that are sampled."""
-        return np.flatnonzero(self.region.traced)
+        return in_frame(self.window, self.shape)[self.region.traced]
 
-    @functools.cached_property
+    @property
     def window(self) -> Window:
         """Rows and columns around the region: all that is computed is a picture of this size."""
-        return bounding_window(self.region.weight > 0)
-
-    @functools.cached_property
-    def part(self) -> Region:
-        """The region within the window."""
-        return self.region[self.window]
+        return self.region.window
 
     @functools.cached_property
     def places(self) -> np.ndarray:
         """Flat index of the traced pixels within the window."""
-        return np.flatnonzero(self.part.traced)
+        return np.flatnonzero(self.region.traced)
 
     @functools.cached_property
     def smooth_albedo(self) -> np.ndarray:
         """(h, w, 3) of the window: albedo where the change is interpolated, at the middle of the pixel; else zero."""
-        there = self.part.interpolated
+        there = self.region.interpolated
         image = np.zeros((*there.shape, 3), np.float32)
         image[there] = centre_albedo(self.worlds, self.rays[in_frame(self.window, self.shape)[there]])
         return image
 
-    def light_at(self, pixels: np.ndarray) -> np.ndarray:
-        """(N, 3) or (3,) irradiance of the pixels."""
-        return self.light if self.light.ndim == 1 else self.light[pixels]
+    @property
+    def light_traced(self) -> np.ndarray:
+        """(N, 3) or (3,) irradiance of the traced pixels."""
+        return self.light if self.light.ndim == 1 else self.light[self.places]
 
     def framed(self, picture: np.ndarray) -> np.ndarray:
         """A picture of the window (h, w, ...) in the frame (H, W, ...), zero around it."""
-        image = np.zeros((*self.shape, *picture.shape[2:]), np.float32)
+        image = untouched((*self.shape, *picture.shape[2:]))
         image[self.window] = picture
         return image
 
@@ -160,7 +166,7 @@ def prepare(
     rays: Rays | LensRays,
     shape: tuple[int, int],
     light: np.ndarray,
-    plate_sigma: np.ndarray,
+    plate_sigma: Sigma,
     white: float,
     limits: Limits,
     effort: Effort,
@@ -174,7 +180,7 @@ def prepare(
         rays: one per pixel of the photograph, in rows.
         shape: (H, W).
         light: (3,) irradiance on the plane under the distant light alone.
-        plate_sigma: (H, W) noise of the photograph, radiance; not finite where unknown.
+        plate_sigma: noise of the photograph.
         white: radiance of display white.
         limits: of the region.
         effort: what to spend.
@@ -202,10 +208,9 @@ def lit(canvas: Canvas, worlds: Worlds, light: np.ndarray, tell: Tell = lambda w
 
     ``light`` (3,) is the irradiance on the plane under their distant light; it is all of E on a plane alone.
     """
-    if not (worlds.convex and worlds.diffuse):
-        inside = in_frame(canvas.window, canvas.shape)
-        light = np.zeros((canvas.shape[0] * canvas.shape[1], 3))
-        light[inside.ravel()] = received(
+    inside = in_frame(canvas.window, canvas.shape)
+    if inside.size and not (worlds.convex and worlds.diffuse):
+        light = received(
             worlds, canvas.rays[inside.ravel()], inside.shape, canvas.effort.samples, canvas.effort, 1.0,
             tell("render: without"),
         )  # fmt: skip
@@ -223,6 +228,7 @@ class Pilot:
     thrown_variance: np.ndarray
     glanced: np.ndarray  # (cells,) bool
     grid: tuple[int, int]
+    shape: tuple[int, int]  # of the photograph
     index: np.ndarray  # (cells,) flat index of the pixel in the middle
     tolerance: float  # relative to LS_noobj, see `Limits`
 
@@ -231,7 +237,8 @@ class Pilot:
 
         None where they are fewer than `FEW_NOISY` of those that stand: not worth another pass.
         """
-        stands = (region.weight.ravel()[self.index] > 0) & ~region.traced.ravel()[self.index] & ~self.glanced
+        rows, columns = np.unravel_index(self.index, self.shape)
+        stands = region.at(rows, columns, region.interpolated) & ~self.glanced
         known = stands & (self.model > 0).all(1)
         relative = self.samples.change_variance[known] / self.model[known] ** 2
         noisy = np.flatnonzero(known)[np.sqrt(relative.max(1) * BLUR_NOISE) > CALM * self.tolerance]
@@ -307,7 +314,7 @@ def looked(
             worlds, rays[index[inside.ravel()]], inside.shape, pilot_samples(effort), effort, CELL
         )
     model = samples.albedo * cell_light / np.pi
-    return Pilot(worlds, samples, model, light_thrown, spread, ~wanted, grid, index, limits.tolerance)
+    return Pilot(worlds, samples, model, light_thrown, spread, ~wanted, grid, shape, index, limits.tolerance)
 
 
 def light_by_cell(worlds: Worlds, film: Film, grid: tuple[int, int], effort: Effort) -> tuple[np.ndarray, np.ndarray]:
@@ -414,7 +421,7 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
     if halves.a.count.max() < TRUSTED:
         return halves.open
     window = bounding_window(scattered(canvas, halves.open) > 0)
-    here = canvas.part[window].weight.shape
+    here = canvas.region[window].weight.shape
     if ahead < JUDGE_SAMPLES * here[0] * here[1]:
         return halves.open
     images = planes_of(canvas, halves.both, JUDGED, window)
@@ -424,14 +431,14 @@ def still_noisy(canvas: Canvas, halves: Halves, ahead: int) -> np.ndarray:
     else:
         noise = np.sqrt(tile_means((images["obj_variance"] + images["change_variance"]).mean(-1)))
     more = needs_more(noise, canvas.plate_sigma[canvas.window][window], tile_means(composite), canvas.white)
-    wanted = np.zeros(canvas.part.traced.shape, bool)
+    wanted = np.zeros(canvas.region.traced.shape, bool)
     wanted[window] = in_tiles(more, here)
     return wanted.ravel()[canvas.places]
 
 
 def scattered(canvas: Canvas, values: np.ndarray) -> np.ndarray:
     """Values (N, ...) of the traced pixels as a picture of the canvas's window, zero elsewhere."""
-    height, width = canvas.part.traced.shape
+    height, width = canvas.region.traced.shape
     image = np.zeros((height * width, *values.shape[1:]), np.float32)
     image[canvas.places] = values
     return image.reshape(height, width, *values.shape[1:])
@@ -442,8 +449,8 @@ def planes_of(
 ) -> dict[str, np.ndarray]:
     """The named fields as pictures of a window in the canvas's, and LS_noobj; the smooth part of the change is in."""
     images = {name: scattered(canvas, getattr(samples, name))[window] for name in names}
-    region, smooth = canvas.part[window], canvas.smooth_albedo[window]  # zero where pixels are traced
-    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.shape, 3)[canvas.window][window]
+    region, smooth = canvas.region[window], canvas.smooth_albedo[window]  # zero where pixels are traced
+    light = canvas.light if canvas.light.ndim == 1 else canvas.light.reshape(*canvas.region.weight.shape, 3)[window]
     light = np.asarray(light / np.pi, np.float32)
     images["albedo"] += smooth
     images["without"] = images["albedo"] * light  # equation 7
@@ -479,7 +486,7 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
         images[f"{name}_noise"] = np.sqrt(images[f"{name}_variance"].mean(-1))
     if not canvas.effort.denoise:
         return images, None
-    window = bounding_window(canvas.part.traced)
+    window = bounding_window(canvas.region.traced)
     view = {name: image[window] for name, image in images.items()}
     given = halves_in(canvas, halves, view, window)
     quiet = None if halves.a.count.max() < TRUSTED else quieted(*given)
@@ -487,7 +494,7 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
         survives, added, obj = glimpsed(*given, fast=halves.passes == 1)
     else:
         survives, added, obj = quiet.survives.rgb, quiet.added.rgb, quiet.obj.rgb
-    here, model = canvas.part.traced[window][..., None], view["without"]
+    here, model = canvas.region.traced[window][..., None], view["without"]
     ground, shown = here & (model > 0), here & (view["alpha"][..., None] > 0)
     view["lost"][:] = np.where(ground, np.minimum(survives - 1, 0) * model, view["lost"])
     view["gained"][:] = np.where(ground, added * model, view["gained"])
@@ -497,6 +504,15 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
         view["change_noise"][:] = np.where(ground[..., 0], left, view["change_noise"])
         view["obj_noise"][:] = in_tiles(quiet.obj.noise, here.shape) * view["alpha"]
     return images, quiet
+
+
+def untouched(shape: tuple[int, ...]) -> np.ndarray:
+    """Zeros, float32, of a large picture of which little will be written: memory is taken page by page (4 kB).
+
+    An array of numpy's own takes 2 MB at the first touch, and zeroing those costs more than what is written.
+    """
+    size = int(np.prod(shape))
+    return np.frombuffer(mmap.mmap(-1, max(4 * size, 1)), np.float32, size).reshape(shape)
 
 
 def in_tiles(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -40,10 +40,12 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Per pixel: ``weight`` (H, W) in [0, 1], 0 where the plate is left alone; ``traced`` (H, W) bool, every pixel
-    computed; elsewhere the relative changes ``lost`` and ``gained`` (H, W, 3), interpolated, with ``variance``.
+    """Per pixel of a window of the photograph, around which it is left alone: ``weight`` (h, w) in [0, 1], 0 where the
+    plate is left alone; ``traced`` (h, w) bool, every pixel computed; elsewhere the relative changes ``lost`` and
+    ``gained`` (h, w, 3), interpolated, with ``variance``.
     """
 
+    window: Window
     weight: np.ndarray
     traced: np.ndarray
     lost: np.ndarray
@@ -52,12 +54,25 @@ class Region:
 
     @property
     def interpolated(self) -> np.ndarray:
-        """(H, W) bool: changed, but smoothly."""
+        """(h, w) bool: changed, but smoothly."""
         return (self.weight > 0) & ~self.traced
 
-    def __getitem__(self, window: Window) -> Region:
-        """A part of it."""
-        return Region(**{name: values[window] for name, values in vars(self).items()})
+    def at(self, rows: np.ndarray, columns: np.ndarray, picture: np.ndarray) -> np.ndarray:
+        """(N,) a picture (h, w) of the window at pixels of the photograph; zero outside the window."""
+        places = [position - own.start for position, own in zip((rows, columns), self.window, strict=True)]
+        inside = np.all([(p >= 0) & (p < size) for p, size in zip(places, picture.shape, strict=True)], axis=0)
+        found = np.zeros(len(rows), picture.dtype)
+        found[inside] = picture[places[0][inside], places[1][inside]]
+        return found
+
+    def __getitem__(self, part: Window) -> Region:
+        """A part of the window."""
+        (top, bottom, _), (left, right, _) = (
+            inner.indices(size) for inner, size in zip(part, self.weight.shape, strict=True)
+        )
+        row, column = (outer.start for outer in self.window)
+        window = slice(row + top, row + bottom), slice(column + left, column + right)
+        return Region(window, *(values[part] for name, values in vars(self).items() if name != "window"))
 
 
 def cell_pixels(height: int, width: int, side: int = CELL) -> tuple[np.ndarray, tuple[int, int]]:
@@ -181,14 +196,12 @@ def plan(
             "left_out_noise": float(np.sqrt(variance[~changed].max())),
             "left_out_mean": float(smoothed[~changed].sum() / smoothed.size),
         }
-    # Only around what changes is there anything to compute: zeros cost nothing until they are read.
     window = _around(changed, shape)
     mask = enlarge(changed, shape, window)
-    weight, everywhere = np.zeros(shape, np.float32), np.zeros(shape, bool)
     ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1) if not mask.all() else np.ones(mask.shape)
-    weight[window] = ramp * ramp * (3 - 2 * ramp)
-    everywhere[window] = enlarge(traced, shape, window) & (weight[window] > 0)
-    return Region(weight, everywhere, *in_pixels((lost, gained, variance), shape, window)), left
+    weight = np.asarray(ramp * ramp * (3 - 2 * ramp), np.float32)
+    everywhere = enlarge(traced, shape, window) & (weight > 0)
+    return Region(window, weight, everywhere, *in_pixels((lost, gained, variance), shape, window)), left
 
 
 def of_cells(
@@ -211,11 +224,8 @@ def of_cells(
 
 
 def in_pixels(cells: tuple[np.ndarray, ...], shape: tuple[int, int], window: Window) -> list[np.ndarray]:
-    """Cells (R, C, K), each interpolated to a picture (H, W, K) float32, within a window; zero around it."""
-    pictures = [np.zeros((*shape, values.shape[2]), np.float32) for values in cells]
-    for picture, values in zip(pictures, cells, strict=True):
-        picture[window] = interpolate(values, shape, window)
-    return pictures
+    """Cells (R, C, K), each interpolated to the picture (h, w, K) float32 of a window."""
+    return [np.asarray(interpolate(values, shape, window), np.float32) for values in cells]
 
 
 def _around(cells: np.ndarray, shape: tuple[int, int]) -> Window:
