@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import latlong_directions, latlong_solid_angles
+from pipeline.light.alike import flux_sigma
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.environment import total_energy
 from pipeline.run.artifacts import EMITTERS, ENVIRONMENT
@@ -43,8 +43,8 @@ def compute(environment: Raster, params: knobs.Lights) -> Result:
         Emitter(
             name="sun" if sun else f"lamp_{number}", direction=patch.direction, solid_angle_sr=patch.solid_angle_sr,
             half_angle_rad=patch.half_angle_rad, irradiance=patch.irradiance, texels=patch.texels,
-            irradiance_sigma=irradiance_sigma(environment, patch), lower_bound=source(environment, patch) == "clipped",
-            evidence=source(environment, patch),
+            irradiance_sigma=flux_sigma(environment, patch.texels, patch.direction),
+            lower_bound=source(environment, patch) == "clipped", evidence=source(environment, patch),
         )
         for number, patch in enumerate(kept, 1)
     ]  # fmt: skip
@@ -70,21 +70,6 @@ def source(environment: Raster, patch: Patch) -> str:
     if not over.any():
         return "measured"
     return "recovered" if environment["recovered"].ravel()[patch.texels][over].all() else "clipped"
-
-
-def irradiance_sigma(environment: Raster, patch: Patch) -> np.ndarray:
-    """Sigma (3,) of a light's irradiance; zero for a map without variance.
-
-    The texels of a recovered flux share one error, so that their sigmas add; those of other texels are independent.
-    """
-    if "variance.R" not in environment.channels:
-        return np.zeros(3)
-    height, width = environment.shape
-    directions = latlong_directions(height, width).reshape(-1, 3)[patch.texels]
-    weight = latlong_solid_angles(height, width).ravel()[patch.texels] * (directions @ patch.direction)
-    sigma = weight[:, None] * np.sqrt(np.maximum(environment.rgb("variance").reshape(-1, 3)[patch.texels], 0))
-    shared = environment.channels.get("recovered", np.zeros((height, width))).ravel()[patch.texels] > 0
-    return np.asarray(np.hypot(sigma[shared].sum(0), np.sqrt((sigma[~shared] ** 2).sum(0))))
 
 
 def is_sun(rgb: np.ndarray, found: list[Patch]) -> bool:

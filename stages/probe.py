@@ -16,6 +16,7 @@ from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, smooth
+from pipeline.light.alike import ALIKE
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import clipped, combine, filling, levelling
@@ -42,7 +43,7 @@ def compute(
     maps, warnings = dict(observed.maps), list(observed.warnings)
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
-    merged = combine.merge(list(maps.values()))
+    merged, alike = combine.merge(list(maps.values())), combine.alike_deg(list(maps.values()))
     rgb, seen = merged.rgb, merged.seen
     shared = np.hypot(observed.scale_sigma, shared_sigma(balance, next(iter(maps))))  # by all: merging keeps it
     variance = merged.variance + (shared * rgb) ** 2
@@ -88,6 +89,7 @@ def compute(
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
         | {SCALE_SIGMA: " ".join(f"{sigma:.6g}" for sigma in np.broadcast_to(shared, 3))}
+        | ({} if alike is None else {ALIKE: f"{alike:.4g}"})
         | near_field.places(centre if near.target is None else near.target, centre),
     )
     coefficients = sh9_of_environment(rgb)

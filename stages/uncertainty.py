@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.budget import geometry, light, pixels
 from pipeline.budget.response import DIMMER, STEP_RAD, Grid, Layers, Response, Seen, points_on, rendered
 from pipeline.conventions import ACESCG
+from pipeline.light.alike import shared_sigma_of
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run.masks import masks_of
@@ -184,7 +185,7 @@ def patterns(
     views: dict[str, View], share: float,
 ) -> tuple[list[light.Pattern], list[light.Pattern]]:  # fmt: skip
     """Ways for the light to be wrong that are followed to the pixels, and those too weak to matter."""
-    shared = light.shared_sigma_of(environment)
+    shared = shared_sigma_of(environment)
     tied = next((balance[name].covariance for name in [*balls, *balance] if name in balance), None)
     found = light.scale_patterns(light.scale_covariance(shared, tied))
     found += light.flux_patterns(environment, emitters, shared) + light.sky_patterns(environment, emitters, shared)

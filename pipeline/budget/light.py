@@ -1,12 +1,12 @@
 """How the light may be wrong: a few patterns of radiance, each of one standard uncertainty, that move independently.
 
 The map's stated variance has four parts with different shapes. What all texels share is *scale* (exposure between plate
-and probe, reflectance of the ball). An emitter's *flux* is its own. The rest of the sky is taken in six smooth *lobes*,
-the squares of the direction's components, which sum to 1: errors of texels are alike within `ALIKE` (the cells on which
-views are compared) and independent beyond. What no view saw moves as one, *unseen*. A wrong centre of the ball or a
-wrong pose of the camera turns the whole map: three *turns*. Which of them the composite can notice is bounded by the
-irradiance they carry to the plane and to the six sides of an object; those that together stay below a share of the
-variance are left out, and said.
+and probe, reflectance of the ball). An emitter's *flux* is its own, as sure as it states. The rest of the sky is taken
+in six smooth *lobes*, the squares of the direction's components, which sum to 1: errors of texels are alike within a
+few pixels of the probe's picture (`pipeline.light.alike`). What no view saw moves as one, *unseen*. A wrong centre of
+the ball or a wrong pose of the camera turns the whole map: three *turns*. Which of them the composite can notice is
+bounded by the irradiance they carry to the plane and to the six sides of an object; those that together stay below a
+share of the variance are left out, and said.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from pipeline.camera.rigid import rotation_exp, skew
 from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
-from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance, resize_environment, total_energy
+from pipeline.light.alike import alike_rows, cell_sums, own_sigma
+from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment, total_energy
 from pipeline.types import BallFit, Emitter, Raster, View
 
-ALIKE_DEG = 2.8  # texels this near are taken to err alike; as wide as the cells of `pipeline.probes.combine`
 BOUND_MAP = (64, 128)  # of the maps whose irradiance bounds a pattern
 UNSEEN = 0.25  # coverage below which a texel was filled in, as the probe stage has it
 
@@ -43,12 +43,6 @@ class Pattern:
     emitter: Emitter | None = None  # whose flux it is
 
 
-def shared_sigma_of(environment: Raster) -> np.ndarray:
-    """(3,) relative standard uncertainty that all texels share; zeros for a map that does not say."""
-    stated = str(environment.attributes.get(SCALE_SIGMA, "0 0 0"))
-    return np.array([float(value) for value in stated.split()])
-
-
 def scale_patterns(covariance: np.ndarray) -> list[Pattern]:
     """Independent patterns of a covariance (3, 3) of the logarithms of the three channels, the largest first."""
     values, vectors = np.linalg.eigh(covariance)
@@ -68,46 +62,19 @@ def scale_covariance(shared: np.ndarray, balance: np.ndarray | None) -> np.ndarr
     return known + np.outer(rest, rest)
 
 
-def own_sigma(environment: Raster, shared: np.ndarray) -> np.ndarray:
-    """(H, W, 3) standard uncertainty of each texel less what all share; zeros for a map without variance.
-
-    Where it is not finite the texel is a lower bound: no sigma covers it, and it is left to the evidence.
-    """
-    if "variance.R" not in environment.channels:
-        return np.zeros((*environment.shape, 3))
-    variance = environment.rgb("variance").astype(float) - (shared * environment.rgb()) ** 2
-    return np.sqrt(np.where(np.isfinite(variance), np.maximum(variance, 0), 0))
-
-
 def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
-    """One pattern per emitter: all its texels by the relative sigma of its flux, less what all light shares.
-
-    A lamp is a few pixels of the ball: how they sample it errs for all its texels together, and for each colour of the
-    mosaic by itself. So texels count as alike within `ALIKE_DEG`, as views disagree, unless its stated sigma is larger.
-    """
-    rgb, sigma, found = environment.rgb().astype(float), own_sigma(environment, shared), []
+    """One pattern per emitter: all its texels by the relative sigma that it states, less what all light shares."""
+    rgb, found = environment.rgb().astype(float), []
     height, width = environment.shape
-    directions, weight = latlong_directions(height, width), latlong_solid_angles(height, width)[..., None]
     for emitter in emitters:
         inside = np.zeros((height, width, 1), bool)
         inside.reshape(-1)[np.asarray(emitter.texels, int)] = True
         stated = np.divide(
             emitter.irradiance_sigma, emitter.irradiance, out=np.zeros(3), where=np.asarray(emitter.irradiance) > 0
         )
-        if emitter.evidence == "measured":
-            cells = _cells(np.where(inside, weight * sigma, 0), directions[..., 1], _rows(height))
-            flux = np.where(inside, weight * rgb, 0).sum((0, 1))
-            alike = np.divide(np.sqrt((cells**2).sum(0)), flux, out=np.zeros(3), where=flux > 0)
-            relative = np.maximum(stated, alike)
-        else:  # recovered: the texels' shared part was added, not squared, so it is in
-            relative = np.sqrt(np.maximum(stated**2 - shared**2, 0))
+        relative = np.sqrt(np.maximum(stated**2 - shared**2, 0))
         found.append(_radiance(f"flux_{emitter.name}", "flux", np.where(inside, rgb, 0) * relative, rgb, emitter))
     return found
-
-
-def _rows(height: int) -> int:
-    """Rows of a map within which texels err alike."""
-    return max(1, round(height * ALIKE_DEG / 180))
 
 
 def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
@@ -120,16 +87,16 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     seen = environment.channels.get("seen", np.ones((height, width)))
     unseen = np.where((seen < UNSEEN)[..., None], sigma, 0)
     sigma = sigma - unseen
-    rows = _rows(height)
+    rows = alike_rows(environment)
     level = np.maximum(rgb, 0)
     lobes, direct = [], np.zeros(3)
     for axis in AXES:
         cosine = np.maximum(directions @ axis, 0)[..., None]
         lobe = cosine**2
-        errors = _cells(weight * lobe * sigma, directions[..., 1], rows)
+        errors = cell_sums(weight * lobe * sigma, rows)
         energy = (weight * lobe * level).sum((0, 1))
         lobes.append(lobe * level * np.sqrt((errors**2).sum(0)) / np.maximum(energy, 1e-300))
-        direct += (_cells(weight * cosine * sigma, directions[..., 1], rows) ** 2).sum(0)
+        direct += (cell_sums(weight * cosine * sigma, rows) ** 2).sum(0)
     # Six numbers average what varies within a lobe: as much is given back as irradiance has of it.
     carried = sum((irradiance(lobe, AXES) ** 2).sum(0) for lobe in lobes)
     back = np.sqrt(np.divide(direct, carried, out=np.ones(3), where=carried > 0))
@@ -137,17 +104,6 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     if unseen.any():
         found.append(_radiance("unseen", "unseen", unseen, rgb))
     return [pattern for pattern in found if pattern.bound > 0]
-
-
-def _cells(values: np.ndarray, height: np.ndarray, rows: int) -> np.ndarray:
-    """Sums (N, 3) of (H, W, 3) over cells of ``rows`` rows, as wide as high on the sphere."""
-    sums = []
-    for top in range(0, values.shape[0], rows):
-        part = values[top : top + rows].sum(0)
-        sine = float(np.sqrt(max(1 - np.mean(height[top : top + rows]) ** 2, 1e-4)))
-        columns = min(max(1, round(2 * rows / 2 / sine)), len(part))
-        sums.append(np.add.reduceat(part, np.arange(0, len(part), columns), 0))
-    return np.concatenate(sums)
 
 
 def direction_covariance(balls: dict[str, BallFit], views: dict[str, View]) -> np.ndarray:

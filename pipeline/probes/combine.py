@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_solid_angles, transform_points
+from pipeline.light.alike import ALIKE_PX
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.filling import enlarge
@@ -71,6 +72,20 @@ def merge(views: list[ViewMap]) -> Merged:
     variance[total <= 0] = np.inf
     seen = np.einsum("vhw,vhw->hw", share, np.stack([view.coverage for view in views]))
     return Merged(rgb, variance, np.clip(seen, 0, 1), ratio, share)
+
+
+def alike_deg(views: list[ViewMap]) -> float | None:
+    """Width [degrees] of cells within which texels err alike: `ALIKE_PX` median pixels of the probe's pictures.
+
+    None when no view says how large its pixels are.
+    """
+    sizes = []
+    for view in views:
+        if view.quality is not None and (seen := view.quality.pixels > 0).any():
+            size = np.sqrt(latlong_solid_angles(*seen.shape)[seen] / view.quality.pixels[seen])
+            weight = np.cumsum(latlong_solid_angles(*seen.shape)[seen][np.argsort(size)])
+            sizes.append(float(np.sort(size)[np.searchsorted(weight, weight[-1] / 2)]))
+    return float(np.degrees(ALIKE_PX * np.mean(sizes))) if sizes else None
 
 
 def sum_of(share: np.ndarray, maps: list[np.ndarray]) -> np.ndarray:

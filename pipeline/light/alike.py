@@ -1,0 +1,78 @@
+"""How sure a sum over texels is: which of their errors are alike.
+
+The map's stated variance is a texel's. Three things tie texels together. What all share (exposure between plate and
+probe, reflectance of the ball) is stated in the map's header. What one flux was recovered for, its texels share. The
+rest is the probe's picture: how its pixels sample a small lamp, each colour of a mosaic by itself, errs for all texels
+within a few pixels together. So those count as alike within cells, and as independent beyond.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.conventions import latlong_directions, latlong_solid_angles
+from pipeline.light.environment import SCALE_SIGMA
+from pipeline.types import Raster
+
+ALIKE = "insitu:alike_deg"  # in a map's header: width of the cells within which texels err alike
+# Pixels of the probe's picture: demosaicking takes in two to each side. Lamps of 1 to 4 degrees, seen in balls of 40 to
+# 240 px through a mosaic, are off by 0.4 to 1.1 times what is stated with it (rms; tests/test_alike.py), lamps of fewer
+# than ten pixels by more.
+ALIKE_PX = 3.0
+ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
+
+
+def alike_rows(environment: Raster) -> int:
+    """Rows of a map within which texels err alike, at least one."""
+    degrees = float(environment.attributes.get(ALIKE, ALIKE_DEG))
+    return max(1, round(environment.shape[0] * degrees / 180))
+
+
+def shared_sigma_of(environment: Raster) -> np.ndarray:
+    """(3,) relative standard uncertainty that all texels share; zeros for a map that does not say."""
+    stated = str(environment.attributes.get(SCALE_SIGMA, "0 0 0"))
+    return np.array([float(value) for value in stated.split()])
+
+
+def own_sigma(environment: Raster, shared: np.ndarray) -> np.ndarray:
+    """(H, W, 3) standard uncertainty of each texel less what all share; zeros for a map without variance.
+
+    Where it is not finite the texel is a lower bound: no sigma covers it, and it is left to the evidence.
+    """
+    if "variance.R" not in environment.channels:
+        return np.zeros((*environment.shape, 3))
+    variance = environment.rgb("variance").astype(float) - (shared * environment.rgb()) ** 2
+    return np.sqrt(np.where(np.isfinite(variance), np.maximum(variance, 0), 0))
+
+
+def cell_sums(values: np.ndarray, rows: int) -> np.ndarray:
+    """Sums (N, C) of a map (H, W, C) over cells of ``rows`` rows, about as wide as high on the sphere."""
+    height, width = values.shape[:2]
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    sums = []
+    for top in range(0, height, rows):
+        part = values[top : top + rows].sum(0)
+        up = (edges[top] + edges[min(top + rows, height)]) / 2
+        columns = min(max(1, round(rows * width / (2 * height) / np.sqrt(max(1 - up**2, 1e-4)))), width)
+        sums.append(np.add.reduceat(part, np.arange(0, width, columns), 0))
+    return np.concatenate(sums)
+
+
+def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Sigma (3,) of the irradiance that texels (N,), flat indices, give a surface that faces ``direction`` (3,).
+
+    Recovered texels share one error, and their variance holds the map's own scale; zero for a map without variance.
+    """
+    height, width = environment.shape
+    inside = np.zeros(height * width, bool)
+    inside[np.asarray(texels, int)] = True
+    inside = inside.reshape(height, width)
+    weight = latlong_solid_angles(height, width) * np.maximum(latlong_directions(height, width) @ direction, 0)
+    weight = (weight * inside)[..., None]
+    shared, told = shared_sigma_of(environment), environment.channels.get("recovered", np.zeros((height, width))) > 0
+    one = weight * own_sigma(environment, np.zeros(3)) * told[..., None]
+    own = weight * own_sigma(environment, shared) * ~told[..., None]
+    all_of_it = shared * (weight * environment.rgb() * ~told[..., None]).sum((0, 1))
+    known = "variance.R" in environment.channels
+    total = one.sum((0, 1)) ** 2 + (cell_sums(own, alike_rows(environment)) ** 2).sum(0) + known * all_of_it**2
+    return np.asarray(np.sqrt(total))
