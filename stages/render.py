@@ -23,6 +23,7 @@ from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run import progress
 from pipeline.run.errors import ManifestError
+from pipeline.run.formats import data_window
 from pipeline.run.stage import Stage
 from pipeline.transport.caustics import Film
 from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
@@ -239,9 +240,10 @@ def by_group(canvases: dict[str, Canvas]) -> Outcome:
         else:
             joined = {n: np.hypot if n.startswith("noise.") else np.add for n in total.channels}
             summed = {n: v if n in shared else joined[n](v, layers[n]) for n, v in total.channels.items()}
-            total = Raster(summed, ACESCG)
+            total = Raster(summed, ACESCG, total.attributes)
     assert total is not None
-    return Raster(total.channels | channels, ACESCG, {"insitu:groups": ",".join(canvases)}), numbers, warnings
+    attributes = total.attributes | {"insitu:groups": ",".join(canvases)}
+    return Raster(total.channels | channels, ACESCG, attributes), numbers, warnings
 
 
 def empty_layers(shape: tuple[int, int]) -> Raster:
@@ -272,7 +274,8 @@ def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
     channels |= {"obj.A": images["alpha"], "ground": images["ground"]}
     channels |= {"noise.change": images["change_noise"] * canvas.region.weight, "noise.obj": images["obj_noise"]}
     channels["influence"] = canvas.region.weight
-    return Raster({name: canvas.framed(values) for name, values in channels.items()}, ACESCG)
+    framed = {name: canvas.framed(values) for name, values in channels.items()}
+    return Raster(framed, ACESCG, {"dataWindow": data_window(*canvas.window)})
 
 
 def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pipeline.camera.lens import project, ray_grid
 from pipeline.camera.rigid import rotation_exp, umeyama
 from pipeline.conventions import latlong_directions, latlong_from_direction
 from pipeline.image.raw import read_metadata, read_mosaic
-from pipeline.run.formats import read_exr, write_exr
+from pipeline.run.formats import data_window, displayed, read_exr, write_exr
 from pipeline.simulation.dng import DngFacts, dng_bytes
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
@@ -84,6 +84,26 @@ def test_maps_say_that_they_are_latlong(tmp_path):
     assert read_exr(path).attributes["envmap"] == "latlong"
     with OpenEXR.File(str(path)) as file:
         assert file.header()["envmap"] == OpenEXR.ENVMAP_LATLONG
+
+
+def test_an_exr_is_read_in_its_display_window(tmp_path):
+    """OpenEXR gives the pixels of the data window, wherever they lie: a crop would be taken for the whole picture."""
+    whole = np.zeros((40, 60), np.float32)
+    whole[10:25, 33:] = NOISE[:15, :27, 0]
+    flags = (whole != 0).astype(np.uint32)
+    window = data_window(slice(10, 25), slice(33, 60))
+    write_exr(tmp_path / "part.exr", Raster({"v": whole, "flags": flags}, "data", {"dataWindow": window}))
+    write_exr(tmp_path / "whole.exr", Raster({"v": whole, "flags": flags}, "data"))
+    assert (tmp_path / "part.exr").stat().st_size < (tmp_path / "whole.exr").stat().st_size
+    for name in ("part", "whole"):
+        back = read_exr(tmp_path / f"{name}.exr")
+        assert np.array_equal(back["v"], whole), name
+        assert np.array_equal(back["flags"], flags), name
+        assert not {"dataWindow", "displayWindow"} & back.attributes.keys()
+    beyond = {"dataWindow": ((-2, -3), (5, 4)), "displayWindow": ((0, 0), (3, 7))}  # overscan, and too short below
+    pixels = NOISE[:8, :8, 0]
+    assert np.array_equal(displayed(pixels, beyond)[:5], pixels[3:, 2:6])
+    assert not displayed(pixels, beyond)[5:].any()
 
 
 def test_trap_1_one_place_writes_exr():

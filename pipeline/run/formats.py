@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import ACESCG
+from pipeline.image.blank import blank
 from pipeline.run.errors import ArtifactError
 from pipeline.run.stage import STATED, Artifact
 from pipeline.types import Raster
@@ -58,6 +59,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
     """Write a single-part scanline EXR, ZIP: uint32 and float16 arrays as they are, all others float32 (or half).
 
+    Where the attribute ``dataWindow`` names a part of the picture, only that is written, zeros are read around it.
     Raises ValueError when channels differ in size. OpenEXR writes wrong pixels from non-contiguous arrays, so every
     channel is made contiguous first.
     """
@@ -66,13 +68,17 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
     shapes = {values.shape for values in raster.channels.values()}
     if len(shapes) != 1:
         raise ValueError(f"{path}: channels of different sizes {sorted(shapes)}")
+    height, width = shapes.pop()
+    whole = ((0, 0), (width - 1, height - 1))
+    part = rows_and_columns(raster.attributes.get("dataWindow", whole))
     kept = {np.dtype(np.uint32), np.dtype(np.float16)}
     float_type = np.float16 if half else np.float32
     channels = {
-        name: np.ascontiguousarray(values, values.dtype if values.dtype in kept else float_type)
+        name: np.ascontiguousarray(values[part], values.dtype if values.dtype in kept else float_type)
         for name, values in raster.channels.items()
     }
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **raster.attributes}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "displayWindow": whole}
+    header |= raster.attributes
     if "envmap" in header:
         header["envmap"] = {"latlong": OpenEXR.ENVMAP_LATLONG, "cube": OpenEXR.ENVMAP_CUBE}[header["envmap"]]
     header["insitu:space"] = raster.space
@@ -88,6 +94,7 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
 def read_exr(path: Path, space: str | None = None) -> Raster:
     """Read an EXR, all channels as stored (half widened to float32).
 
+    The picture is that of its display window: zero where there are no data, cut where data lie beyond it.
     ``space`` None takes what the file says. Raises ArtifactError when it cannot be read, or its space is another one.
     """
     import OpenEXR
@@ -98,7 +105,7 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header, pixels = dict(file.header()), file.channels()  # closing the file empties its header
             channels = {
-                name: np.asarray(c.pixels, np.uint32 if c.pixels.dtype == np.uint32 else np.float32)
+                name: displayed(np.asarray(c.pixels, np.uint32 if c.pixels.dtype == np.uint32 else np.float32), header)
                 for name, c in pixels.items()
             }
     except (RuntimeError, ValueError) as error:
@@ -115,6 +122,33 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
     if found not in (None, "unknown"):
         known.add("chromaticities")  # primaries without a name stay in the attributes
     return Raster(channels, found or space or "unknown", {k: v for k, v in header.items() if k not in known})
+
+
+def rows_and_columns(window: Any) -> tuple[slice, slice]:
+    """Of a window as OpenEXR has it: x, y of the first and of the last pixel."""
+    (left, top), (right, bottom) = ((int(v) for v in corner) for corner in window)
+    return slice(top, bottom + 1), slice(left, right + 1)
+
+
+def data_window(rows: slice, columns: slice) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The same the other way round."""
+    return (int(columns.start), int(rows.start)), (int(columns.stop) - 1, int(rows.stop) - 1)
+
+
+def displayed(pixels: np.ndarray, header: dict[str, Any]) -> np.ndarray:
+    """Pixels of the data window brought to the display window."""
+    data, shown = (rows_and_columns(header[name]) for name in ("dataWindow", "displayWindow"))
+    if data == shown:
+        return pixels
+    picture = blank(tuple(axis.stop - axis.start for axis in shown)).view(pixels.dtype)
+    both = [slice(max(d.start, s.start), min(d.stop, s.stop)) for d, s in zip(data, shown, strict=True)]
+    if all(axis.start < axis.stop for axis in both):
+        to, of = (
+            tuple(slice(b.start - own.start, b.stop - own.start) for b, own in zip(both, window, strict=True))
+            for window in (shown, data)
+        )
+        picture[to] = pixels[of]
+    return picture
 
 
 def space_of_chromaticities(chromaticities: Any) -> str | None:

@@ -9,13 +9,13 @@ each other or gloss, E is the path-traced radiance without objects over the albe
 from __future__ import annotations
 
 import functools
-import mmap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
+from pipeline.image.blank import blank
 from pipeline.transport.caustics import Film, photons_for, thrown, throws
 from pipeline.transport.denoise import (
     TILE,
@@ -147,7 +147,7 @@ class Canvas:
 
     def framed(self, picture: np.ndarray) -> np.ndarray:
         """A picture of the window (h, w, ...) in the frame (H, W, ...), zero around it."""
-        image = untouched((*self.shape, *picture.shape[2:]))
+        image = blank((*self.shape, *picture.shape[2:]))
         image[self.window] = picture
         return image
 
@@ -504,15 +504,6 @@ def pictures(canvas: Canvas, halves: Halves) -> tuple[dict[str, np.ndarray], Qui
         view["change_noise"][:] = np.where(ground[..., 0], left, view["change_noise"])
         view["obj_noise"][:] = in_tiles(quiet.obj.noise, here.shape) * view["alpha"]
     return images, quiet
-
-
-def untouched(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros, float32, of a large picture of which little will be written: memory is taken page by page (4 kB).
-
-    An array of numpy's own takes 2 MB at the first touch, and zeroing those costs more than what is written.
-    """
-    size = int(np.prod(shape))
-    return np.frombuffer(mmap.mmap(-1, max(4 * size, 1)), np.float32, size).reshape(shape)
 
 
 def in_tiles(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
