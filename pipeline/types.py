@@ -132,6 +132,20 @@ class Camera(Record):
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
 
+class Motion(Record):
+    """How the camera moved on its tripod between the view that shows the board and the plate, by what both show.
+
+    The turn is undone in the pose; the ``rest``, where still things lie off it, is not: parallax of a tripod that was
+    pushed aside, or a lens that was touched.
+    """
+
+    of: str  # the view that shows the board
+    rotation: Array  # (3,) rad, p_of = exp(rotation) p_plate in camera frames
+    covariance: Array  # (3, 3) of it
+    rest: Array  # (3, 2) px: (1, x / width - 1/2, y / height - 1/2) @ rest is what is left at a pixel x, y
+    rest_covariance: Array  # (3, 3) of each column of it
+
+
 class View(Record):
     """Where one photograph was taken from."""
 
@@ -144,6 +158,14 @@ class View(Record):
     alternative: Array | None = None  # (4, 4) the second planar solution, refined
     lens_covariance: Array | None = None  # (6, L) of the pose with the camera's L numbers; None when given
     camera: Camera | None = None  # its own body, lens or size; None: the plate's
+    motion: Motion | None = None  # what was undone; of a plate that was registered to a tripod view
+
+
+class Sources(Record):
+    """What the further views are needed for: decided before they are oriented, by what is cheaper."""
+
+    cloud: bool = False  # whether they are to be oriented at all
+    views: list[str] = []  # whose pose is to come from them: no cheaper source is good enough, or it was asked for
 
 
 class Reconstruction(Record):
@@ -162,6 +184,7 @@ class Reconstruction(Record):
     seen_view: Indices = np.zeros(0, int)  # (K,) which photograph
     seen_point: Indices = np.zeros(0, int)  # (K,) shows which point
     px: Array = np.zeros((0, 2))  # (K, 2) where
+    orients: list[str] = []  # views whose pose is to come from it, by `Sources`
 
 
 class BallFit(Record):
@@ -175,6 +198,7 @@ class BallFit(Record):
     radius_px: float
     reflectance: Array = np.ones(3)  # (3,) head on, ACEScg
     edge_tint: Array | None = None  # (3,) of its angle dependence; None: the same at all angles
+    glass: float = 0.0  # thickness of the glass before the mirror, of the radius; 0: none
 
 
 class Plane(Record):

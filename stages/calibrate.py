@@ -4,7 +4,7 @@ Method: corners of the board; a start by Zhang's method (OpenCV); joint least sq
 (Gauss-Newton, poses eliminated); which terms of distortion stay, and whether the lens is a fisheye, is decided by
 photographs that it was not fitted to (`pipeline/camera/lens_ladder.py`). Covariance: inverse normal matrix of the
 chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Without
-board photographs the lens comes from the tracks of the further views (stage sfm), with the same covariance; from a
+board photographs the lens comes from the tracks of the further views where they were oriented (stage sfm); from a
 former calibration; or, for want of all these, from the focal length in EXIF and lensfun, with the uncertainty of such
 words. A set of photographs that leaves rays of the frame uncertain is flagged, and the one to take next is named.
 Limits: one focus and zoom for all photographs of a camera; a flat board; a fisheye to 88 degrees from its axis; whether
@@ -14,24 +14,18 @@ could cost.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.camera import board_doubts
 from pipeline.camera.adjustment import Adjustment
-from pipeline.camera.board_kinds import sightings_of
-from pipeline.camera.board_pictures import board_picture
+from pipeline.camera.board_photos import corners_of
 from pipeline.camera.distortion import model_of
 from pipeline.camera.exif_camera import exif_camera
 from pipeline.camera.former_camera import reused
 from pipeline.camera.given_camera import given_camera
-from pipeline.camera.lens_ladder import FEWEST_PHOTOS, SURE, Photos, best_lens
-from pipeline.camera.opencv_bridge import Sightings
+from pipeline.camera.lens_ladder import SURE, Photos, best_lens
 from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
 from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
@@ -41,7 +35,6 @@ from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result
 from stages import knobs
 
-FEWEST_CORNERS = 8  # of a photograph that is used
 REFUSED_FOCAL = 0.05  # standard uncertainty, relative
 NAMES = {"brown": "Brown's", "rational": "the rational model's", "fisheye": "the fisheye's"}
 PATTERN_PX = 0.1  # size from which residuals are said to have a pattern
@@ -58,7 +51,7 @@ def compute(
     stated, photos, frame = facts["camera"], photos_of(board_photos, "plate"), frame_of(brackets, "plate")
     if stated.get("given") or stated.get("former") or photos:
         whole = calibrated(facts, "camera", stated, frame, photos, params)
-    elif facts.get("views"):
+    elif reconstruction.names:
         whole = from_tracks(reconstruction, frame)
     else:
         lens_name = (facts.get("lens") or {}).get("name") or ""
@@ -143,50 +136,10 @@ def calibrated(
         }
         return Result({"camera": camera}, {"source": "given"}, [], [term])
     warnings: list[str] = []
-    photos, size = sight(facts, board_photos, warnings)
+    photos, size = corners_of(facts, board_photos, warnings)
     chosen, warnings = best_lens(photos, size, warnings)
     judged = judge(chosen.fit, chosen.photos, chosen.errors, chosen.evidence, warnings, params)
     return replace(judged, outputs={"camera": of_optics(judged.outputs["camera"], frame)})
-
-
-def sight(
-    facts: dict[str, Any], board_photos: list[dict[str, str]], warnings: list[str]
-) -> tuple[Photos, tuple[int, int]]:
-    """Corners of every photograph in which enough are seen, and (width, height)."""
-    root = Path(facts["capture_root"])
-    files = [photo["file"] for photo in board_photos]
-
-    def look(file: str) -> tuple[tuple[int, int], Sightings]:
-        plain, precise = board_picture(root / file)
-        return (plain.shape[1], plain.shape[0]), sightings_of(plain, precise, facts["board"])
-
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # OpenCV releases the GIL
-        found = list(pool.map(look, files))
-    sizes = {size: file for file, (size, _) in zip(files, found, strict=True)}
-    if len(sizes) > 1:
-        listed = ", ".join(f"{w}x{h} ({file})" for (w, h), file in sizes.items())
-        turned = " as on the sensor (some are turned by 90 degrees)" if len({min(s) for s in sizes}) == 1 else ""
-        raise CaptureError(f"calibration photographs: sizes {listed}, needed one size{turned}; take out the others")
-    double = [i for i, (_, seen) in enumerate(found) if len(seen.twice) >= board_doubts.TWICE]
-    usable = [i for i, (_, seen) in enumerate(found) if len(seen.px) >= FEWEST_CORNERS and i not in double]
-    for i in double:
-        warnings.append(f"{files[i]}: {len(found[i][1].twice)} ids are seen twice, needed one board; left out")
-    for i in sorted(set(range(len(files))) - set(usable) - set(double)):
-        seen = found[i][1]
-        warnings.append(
-            f"{files[i]}: {len(seen.px)} corners ({seen.markers} markers) found, needed {FEWEST_CORNERS}; left out"
-        )
-    if len(usable) < FEWEST_PHOTOS:
-        others = [board_picture(root / files[i])[0] for i in range(len(files)) if i not in usable and i not in double]
-        instead = board_doubts.of_board(others, facts["board"]) if others else ""
-        cover = "; cover all boards but one" if double else ""
-        raise CaptureError(
-            f"calibration: {len(usable)} of {len(files)} photographs show the board, needed {FEWEST_PHOTOS}{cover}; "
-            + (instead or "check [board] (dictionary, squares, legacy)")
-            + "; photograph the whole board sharply from several tilts"
-        )
-    photos = Photos([files[i] for i in usable], [found[i][1].world_m for i in usable], [found[i][1].px for i in usable])
-    return photos, next(iter(sizes))
 
 
 def judge(

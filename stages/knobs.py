@@ -44,6 +44,17 @@ class Balance(Params):
     """No knobs: the references are facts."""
 
 
+class Sources(Params):
+    """Which source of pose and lens is good enough."""
+
+    cloud: Literal["auto", "always", "never"] = Field(
+        "auto", description="orient further views: when cheaper sources leave too much, or always, or never"
+    )
+    contact_px: float = Field(
+        0.5, gt=0, description="uncertainty where objects stand, up to which a cheaper source is taken [px]"
+    )
+
+
 class Sfm(Params):
     """Structure from motion over further views."""
 
@@ -152,7 +163,7 @@ class Report(Params):
 
 
 KNOBS: dict[str, type[Params]] = {
-    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sfm": Sfm,
+    "ingest": Ingest, "merge": Merge, "develop": Develop, "balance": Balance, "sources": Sources, "sfm": Sfm,
     "calibrate": Calibrate, "pose": Pose, "probe": Probe, "lights": Lights, "plane": Plane, "reflectance": Reflectance,
     "render": Render, "composite": Composite, "uncertainty": Uncertainty, "evaluate": Evaluate, "report": Report,
 }  # fmt: skip

@@ -8,8 +8,8 @@ import importlib
 from pipeline.run.stage import Graph
 
 NAMES = (
-    "ingest", "merge", "develop", "balance", "sfm", "calibrate", "pose", "probe", "lights", "plane", "reflectance",
-    "render", "composite", "uncertainty", "evaluate", "report",
+    "ingest", "merge", "develop", "balance", "sources", "sfm", "calibrate", "pose", "probe", "lights", "plane",
+    "reflectance", "render", "composite", "uncertainty", "evaluate", "report",
 )  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.cloud_plane import AGREE_CHI2, CloudPlane, plane_of_cloud
-from pipeline.camera.lens import project, project_jacobians
+from pipeline.camera.contact import contact_sigma
+from pipeline.camera.lens import project
 from pipeline.camera.planes_in_cloud import flat_surfaces
 from pipeline.camera.rigid import camera_points
 from pipeline.camera.view_checks import check_feet, feet_of, height_above
@@ -273,23 +274,6 @@ def plane_covariance(view: View) -> np.ndarray:
     x, _, z = view.world_from_camera[:3, 3]
     by_pose = np.array([[-1.0, 0, 0, 0, 0, 0], [0, 0, -1.0, 0, 0, 0], [-z, 0, x, 0, -1.0, 0]])
     return by_pose @ view.covariance @ by_pose.T
-
-
-def contact_sigma(camera: Camera, view: View, spot: np.ndarray) -> float:
-    """Largest standard uncertainty, px, of where a point (3,) of the world appears in the plate; NaN outside the lens.
-
-    Pose and lens were estimated together: a lens error is mostly undone by the pose, which their correlation carries.
-    """
-    point, by_pose = camera_points(view.world_from_camera, spot[None])
-    _, by_point, by_lens = project_jacobians(camera, point)
-    if not np.isfinite(by_point).all():
-        return float("nan")
-    pose, lens = by_point[0] @ by_pose[0], by_lens[0]
-    covariance = pose @ view.covariance @ pose.T
-    if view.lens_covariance is not None:
-        cross = pose @ view.lens_covariance @ lens.T
-        covariance = covariance + cross + cross.T + lens @ camera.covariance @ lens.T
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
 
 
 def evidence(view: View, cloud: dict[str, Any] | None = None) -> list[dict[str, Any]]:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera import board_doubts
+from pipeline.camera.board_pictures import linear_of
 from pipeline.camera.cloud_views import views_of_cloud
 from pipeline.camera.estimates import (
     MOVED_CHI2,
@@ -39,13 +40,12 @@ from pipeline.camera.estimates import (
 from pipeline.camera.map_report import report
 from pipeline.camera.marker_map import with_tripod
 from pipeline.camera.markers import grey
-from pipeline.camera.opencv_bridge import Sightings, read_grey
+from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.pose_report import figures, reasons
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.camera.sights import FEWEST_CORNERS, marks_in
 from pipeline.camera.tripod_registration import lender, registered, turn_said, turned
-from pipeline.image.colour import decode_srgb
 from pipeline.probes.standing import standing_chi2
 from pipeline.run.artifacts import (
     CAMERA,
@@ -71,7 +71,8 @@ def compute(
 ) -> Result:  # fmt: skip
     """``world_from_camera`` of "plate" and of every ball, and the camera of each that is not the plate's."""
     balls = {ball["name"]: bool(ball.get("tripod", False)) for ball in facts["ball"]}
-    orders = {name: order_of(facts, name, balls) for name in ("plate", *balls)}
+    by_cloud = [name for name in reconstruction.orients if name in reconstruction.names]
+    orders = {name: order_of(facts, name, balls, by_cloud) for name in ("plate", *balls)}
     cameras = {name: view_cameras.get(name, camera) for name in orders}
     check_sizes(photographs, cameras)
     tripod = [name for name, stays in balls.items() if stays and not orders[name]["explicit"]]
@@ -91,7 +92,15 @@ def compute(
     extra: dict[str, Any] = {}
     cloud = Reconstruction()
     if asked:
-        found = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
+        try:
+            found = by_views(facts, asked, tripod, photographs, camera, reconstruction, view_photos, warnings)
+        except (CaptureError, NumericalError) as error:
+            if any(orders[name]["explicit"] for name in asked):
+                raise
+            without = reconstruction.model_copy(update={"orients": []})
+            whole = compute(facts, photographs, camera, view_cameras, without, view_photos, params)
+            said = f"pose: further views cannot orient {', '.join(asked)} ({error}); boards and markers alone did"
+            return replace(whole, warnings=[said, *whole.warnings])
         views, extra, cloud = views | found[0], found[1], found[2]
     places: dict[str, Any] = {}
     if mapped:
@@ -166,8 +175,8 @@ def without_marks(
     return figures
 
 
-def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[str, Any]:
-    """How a view is to be oriented: the manifest's [[pose]] entry, else by the board, else by the marker."""
+def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool], by_cloud: list[str]) -> dict[str, Any]:
+    """How a view is to be oriented: its [[pose]] entry, else by the cloud (``by_cloud``), the board or the marker."""
     for entry in facts.get("pose", []):
         if entry["view"] == name:
             if entry["route"] in ("charuco", "marker") and not facts.get(
@@ -177,6 +186,8 @@ def order_of(facts: dict[str, Any], name: str, balls: dict[str, bool]) -> dict[s
                     f"pose: view {name} asks for {entry['route']}, which the manifest does not describe"
                 )
             return {**entry, "explicit": True}
+    if name in by_cloud:
+        return {"route": "colmap", "explicit": False}
     for route, fact in (("charuco", "board"), ("marker", "marker")):
         if facts.get(fact):
             return {"route": route, "explicit": False}
@@ -218,11 +229,6 @@ def by_views(
     )
     warnings += said
     return found, numbers, cloud
-
-
-def linear_of(file: Path) -> np.ndarray:
-    """(H, W) float32 linear grey of a further photograph."""
-    return np.asarray(decode_srgb(np.asarray(read_grey(file), np.float32) / 255), np.float32)
 
 
 def by_map(

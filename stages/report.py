@@ -26,6 +26,10 @@ TITLES = {
     "merge": ("Brackets to radiance", "Merged on the sensor's mosaic, each sample weighted by its noise."),
     "develop": ("Radiance to colour", "Demosaicked and brought to ACEScg by the camera's own matrices."),
     "balance": ("One scale for all views", "Exposure and colour of each view against the plate's, by what both saw."),
+    "sources": (
+        "What is good enough",
+        "Whether board and markers leave the objects' feet certain enough, or a cloud is needed.",
+    ),
     "sfm": ("What all photographs share", "Poses and a cloud of points from further views, when there are any."),
     "calibrate": ("The lens", "Intrinsics and distortion from board or tracks; terms are taken on evidence."),
     "pose": (

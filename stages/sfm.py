@@ -1,4 +1,4 @@
-"""Orient all photographs by what they show (COLMAP), when further views are given: poses, cloud, lens; no unit yet.
+"""Orient all photographs by what they show (COLMAP), when stage sources asks: poses, cloud, lens; no unit yet.
 
 Method: SIFT features on the photographs as they are and on the developed plate and ball views through a tone curve,
 exhaustive matching, incremental or global mapping (COLMAP), one seed. Views taken with the plate's camera share its
@@ -21,10 +21,10 @@ from pipeline.camera.markers import grey, tone
 from pipeline.camera.opencv_bridge import read_grey
 from pipeline.camera.sfm import camera_start
 from pipeline.camera.view_checks import only_turned, parallax_deg
-from pipeline.run.artifacts import BRACKETS, FACTS, PHOTOGRAPHS, RECONSTRUCTION, VIEW_PHOTOS
+from pipeline.run.artifacts import BRACKETS, FACTS, PHOTOGRAPHS, RECONSTRUCTION, SOURCES, VIEW_PHOTOS
 from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.run.stage import Stage
-from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Result
+from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Result, Sources
 from stages import knobs
 
 FEW_TRACKS = 30  # a photograph with fewer sightings of the cloud hangs by a thread
@@ -32,17 +32,11 @@ FEW_TRACKS = 30  # a photograph with fewer sightings of the cloud hangs by a thr
 
 def compute(
     facts: dict[str, Any], brackets: dict[str, Bracket], view_photos: list[Frame], photographs: dict[str, Raster],
-    params: knobs.Sfm,
+    sources: Sources, params: knobs.Sfm,
 ) -> Result:  # fmt: skip
-    """The reconstruction; empty without further views."""
-    if not view_photos:
-        term = {
-            "term": "further views",
-            "modelled": False,
-            "because": "none are given",
-            "could_cost": "nothing where a board or marker is in the plate; else there is no pose",
-        }
-        return Result({"reconstruction": Reconstruction()}, {"photos": 0}, [], [term])
+    """The reconstruction; empty where it is not needed. What that could cost, stage sources says."""
+    if not sources.cloud:
+        return Result({"reconstruction": Reconstruction()}, {"photos": 0})
     cameras, bodies = bodies_of(facts, brackets, view_photos)
     root = Path(facts["capture_root"])
     pictures = {name: _seen(photograph) for name, photograph in photographs.items() if name in bodies}
@@ -77,6 +71,7 @@ def compute(
         "because": f"{len(made.names)} of {len(pictures)} photographs hang together by {len(made.points)} points",
         "could_cost": "",
     }  # fmt: skip
+    made = made.model_copy(update={"orients": sources.views})
     return Result({"reconstruction": made}, numbers, warnings, [term])
 
 
@@ -129,6 +124,12 @@ STAGE = Stage(
     "sfm",
     compute,
     knobs.Sfm,
-    inputs={"facts": FACTS, "brackets": BRACKETS, "view_photos": VIEW_PHOTOS, "photographs": PHOTOGRAPHS},
+    inputs={
+        "facts": FACTS,
+        "brackets": BRACKETS,
+        "view_photos": VIEW_PHOTOS,
+        "photographs": PHOTOGRAPHS,
+        "sources": SOURCES,
+    },
     outputs={"reconstruction": RECONSTRUCTION},
 )

@@ -12,7 +12,7 @@ from printed_board import BOARD, MARKER, charuco_print, looking_at, marker_print
 from test_bundle import noisy, world
 from test_calibrate import POINTS, TRUTH, corners_of, poses_of
 
-from pipeline.camera import board_doubts, view_checks
+from pipeline.camera import board_doubts, board_photos, view_checks
 from pipeline.camera.bundle import adjust
 from pipeline.camera.lens import project
 from pipeline.camera.lens_ladder import Photos, drop_bad
@@ -24,7 +24,7 @@ from pipeline.probes.finding import Found, complaints
 from pipeline.probes.outline import Height
 from pipeline.run.errors import CaptureError
 from pipeline.types import Camera, Frame, Raster, Reconstruction
-from stages import calibrate, ingest, knobs, pose
+from stages import ingest, knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1)
 CENTRE = np.array([0.105, 0, 0.075])
@@ -129,7 +129,7 @@ class TestCalibration:
             cv2.imwrite(str(folder / f"{number}.png"), picture)
         facts = {"capture_root": str(folder), "board": board, "camera": {"calibration": ["*.png"], "given": None}}
         photos = [{"file": f"{number}.png"} for number in range(len(pictures))]
-        return calibrate.sight(facts, photos, [])
+        return board_photos.corners_of(facts, photos, [])
 
     def test_wrong_dictionary(self, board_picture, tmp_path):
         with pytest.raises(CaptureError, match=r'0 of 3 .* what it shows fits dictionary = "DICT_5X5_100", squares'):

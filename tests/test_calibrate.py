@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from printed_board import BOARD, charuco_print, looking_at, photograph
 
-from pipeline.camera import opencv_bridge
+from pipeline.camera import board_photos, opencv_bridge
 from pipeline.camera.adjustment import adjust, free_columns, lens_vector
 from pipeline.camera.lens import project
 from pipeline.camera.lens_ladder import disagreement
@@ -53,10 +53,10 @@ def run(monkeypatch: pytest.MonkeyPatch, corners: list[np.ndarray], sizes: list[
     """The stage on given corners instead of pictures."""
     sizes = sizes or [(768, 1024)] * len(corners)
     monkeypatch.setattr(
-        calibrate, "board_picture", lambda path: (np.full(sizes[int(path.stem)], int(path.stem), np.uint8),) * 2
+        board_photos, "board_picture", lambda path: (np.full(sizes[int(path.stem)], int(path.stem), np.uint8),) * 2
     )
     monkeypatch.setattr(
-        calibrate, "sightings_of",
+        board_photos, "sightings_of",
         lambda grey, _, board: Sightings(POINTS[: len(corners[grey[0, 0]])], corners[grey[0, 0]], np.arange(24), 17),
     )  # fmt: skip
     facts = {"capture_root": ".", "board": BOARD, "camera": {"calibration": ["*.jpg"], "given": None}}

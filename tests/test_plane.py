@@ -7,6 +7,7 @@ import pytest
 from printed_board import BOARD, looking_at
 
 from pipeline.camera.cloud_plane import plane_of_cloud
+from pipeline.camera.contact import contact_sigma
 from pipeline.camera.lens import project
 from pipeline.camera.resection import refine
 from pipeline.camera.rigid import camera_points, perturb
@@ -125,9 +126,9 @@ def test_contact_agrees_with_re_estimated_poses() -> None:
     fit = refine(stated_camera, POSE, points, exact, 0.1)
     view = view_of(POSE, covariance=fit.covariance, lens_covariance=fit.lens_covariance)
     # 400 samples: a standard deviation has 3.5 % standard error
-    assert plane.contact_sigma(stated_camera, view, foot) == pytest.approx(largest, rel=0.12)
+    assert contact_sigma(stated_camera, view, foot) == pytest.approx(largest, rel=0.12)
     without = view_of(POSE, covariance=fit.covariance)
-    assert plane.contact_sigma(stated_camera, without, foot) > 2 * largest  # the correlation matters
+    assert contact_sigma(stated_camera, without, foot) > 2 * largest  # the correlation matters
 
 
 @pytest.mark.parametrize(("tilt", "outcome"), [(80, "fine"), (87, "warned"), (89.5, "refused")])

@@ -15,7 +15,7 @@ from pipeline.run import artifacts as A
 from pipeline.run import formats
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
 from pipeline.types import Bracket, Camera, Frame, Reconstruction
-from stages import knobs, sfm
+from stages import knobs, sfm, sources
 from stages.order import graph
 
 COUNTER = SAMPLES / "counter"
@@ -57,9 +57,10 @@ def test_a_given_lens_is_checked_before_it_is_used() -> None:
 
 
 def test_nothing_is_done_without_further_views() -> None:
-    result = sfm.compute({}, {}, [], {}, knobs.Sfm())
+    decided = sources.compute({}, {}, {}, [], [], {}, knobs.Sources())
+    assert decided.evidence[0]["modelled"] is False
+    result = sfm.compute({}, {}, [], {}, decided.outputs["sources"], knobs.Sfm())
     assert result.outputs["reconstruction"].names == []
-    assert result.evidence[0]["modelled"] is False
 
 
 def test_a_marker_seen_once_gives_no_metre() -> None:

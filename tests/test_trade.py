@@ -305,7 +305,7 @@ def test_points_share_stages_are_charged_in_full_and_are_not_run_again(toy):
     session.run([base, width, dark, Point("again", "design", "preview")])
     first, second, third = session.rows  # the fourth has the settings of the first
     assert first["linked"] == []
-    assert set(second["linked"]) == {"ingest", "merge", "develop", "balance", "sfm", "calibrate", "pose"}
+    assert set(second["linked"]) == {"ingest", "merge", "develop", "balance", "sources", "sfm", "calibrate", "pose"}
     assert second["cpu_seconds"] == first["cpu_seconds"] == 2.0 * len(first["stages"])
     assert third["failed"] == "too dark"
     again = trade.Session(toy, said.append)

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.camera.markers import grey, tone
 from pipeline.camera.opencv_bridge import read_grey
+from pipeline.image.colour import decode_srgb
 from pipeline.image.demosaic import balance_gains, demosaic
 from pipeline.image.frames import read_frame, read_samples
 from pipeline.types import Frame
@@ -35,6 +36,11 @@ def board_picture(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return plain, plain
     toned = tone(light_of(samples, frame))
     return np.asarray(toned * 255 + 0.5, np.uint8), toned
+
+
+def linear_of(file: Path) -> np.ndarray:
+    """(H, W) float32 linear grey of a further photograph, a finished picture."""
+    return np.asarray(decode_srgb(np.asarray(read_grey(file), np.float32) / 255), np.float32)
 
 
 def light_of(samples: np.ndarray, frame: Frame) -> np.ndarray:

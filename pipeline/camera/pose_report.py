@@ -61,7 +61,8 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: 
     """Which pose source each view took, and why."""
     why = {
         "charuco": "the board is described", "marker": "markers are described", "points": "asked for",
-        "given": "asked for", "same_as": "same tripod position as the plate", "colmap": "asked for",
+        "given": "asked for", "same_as": "same tripod position as the plate",
+        "colmap": "board and markers do not show, or leave it less certain than sources.contact_px",
         "tripod": "shows no board; a view from the same tripod does, and both pictures say how the camera turned",
     }  # fmt: skip
     entries = [

@@ -18,6 +18,7 @@ from pipeline.types import (
     Plane,
     Proxy,
     Reconstruction,
+    Sources,
     Surface,
     View,
 )
@@ -56,8 +57,12 @@ CORRECTIONS = Artifact(
     "corrections", "cdl", "ASC CDL collection: every view's gains and their inverse; the plate made neutral, offered"
 )
 
+SOURCES = Artifact(
+    "sources", "json", "what further views are needed for: no, lens and cloud, or also the pose of which view",
+    type=Sources,
+)  # fmt: skip
 RECONSTRUCTION = Artifact(
-    "reconstruction", "json", "poses and cloud of all photographs in a frame of its own; empty without further views",
+    "reconstruction", "json", "poses and cloud of all photographs in a frame of its own; empty unless needed",
     type=Reconstruction,
 )  # fmt: skip
 CAMERA = Artifact("camera", "json", "the plate's intrinsics, distortion, covariance", "px", type=Camera)

@@ -1,0 +1,150 @@
+"""Whether further views are needed: what boards and markers alone leave uncertain, in pixels where the objects stand.
+
+Method: poses by what is cheap (board, markers, a stated pose; a bare plate by its tripod) through the lens as known
+without further views (stated, calibrated before, of board photographs, or EXIF's), and their covariance pushed to the
+objects' feet. Further views are oriented (stage sfm, COLMAP) when a view shows no mark, when its marker has two poses,
+when corner noise alone leaves the foot less certain than ``contact_px``, or when a lens that only EXIF tells of does: a
+lens of other sources would be held by the cloud as well, so its part is not what the cloud could lessen. Limits: corner
+noise and the ambiguity that is refused are taken at pose's defaults; surfaces beside the plane that only a cloud shows
+are no reason (cloud = always looks for them).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera.markers import grey
+from pipeline.camera.sources import KnownLens, by_marks, known_lens, left_at, stated_view
+from pipeline.camera.view_checks import feet_of
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, FACTS, PHOTOGRAPHS, SOURCES, VIEW_PHOTOS, WISHES
+from pipeline.run.errors import ManifestError
+from pipeline.run.stage import Stage
+from pipeline.types import Bracket, Frame, Raster, Result, Sources, View
+from stages import knobs
+
+NOT_LOOKED = "surfaces beside the plane are not looked for in a cloud; sources.cloud = always looks"
+
+
+def compute(
+    facts: dict[str, Any], wishes: dict[str, Any], brackets: dict[str, Bracket], board_photos: list[dict[str, str]],
+    view_photos: list[Frame], photographs: dict[str, Raster], params: knobs.Sources,
+) -> Result:  # fmt: skip
+    """What the further views are needed for; nothing without any."""
+    if not view_photos:
+        cost = "nothing where a board or marker is in the plate; else there is no pose"
+        return Result({"sources": Sources()}, {"cloud": False}, [], [term(False, "none are given", cost)])
+    routes = {entry["view"]: entry["route"] for entry in facts.get("pose", [])}
+    named = [name for name, route in routes.items() if route == "colmap"]
+    if named and params.cloud == "never":
+        raise ManifestError(
+            f"sources.cloud: is never, but [[pose]] orients {', '.join(named)} by route colmap; expected auto or always"
+        )
+    numbers: dict[str, Any] = {}
+    reasons = dict.fromkeys(named, "asked for by [[pose]]")
+    free = [name for name in by_plates_camera(facts) if name not in routes] if has_marks(facts) else []
+    lens_reason = ""
+    if free or "plate" not in named:  # else the cloud gives the lens and every pose, whatever else would
+        lens = known_lens(facts, brackets["plate"].frames[0], board_photos)
+        found = cheap_views(facts, routes, photographs, view_photos, lens)
+        reasons |= {name: missing for name in free if isinstance(missing := found.get(name), str)}
+        if isinstance(plate := found.get("plate"), View):
+            numbers, short, lens_reason = judged(plate, lens, spots_of(facts, wishes), params.contact_px)
+            reasons |= {"plate": short} if short and "plate" in free else {}
+        elif lens.source == "unknown" and "plate" not in reasons:
+            lens_reason = "nothing is said of it"
+    why = [f"{name}: {reason}" for name, reason in reasons.items()] + [f"lens: {lens_reason}"] * bool(lens_reason)
+    cloud = params.cloud == "always" or (params.cloud == "auto" and bool(why))
+    views = list(dict.fromkeys([*reasons, *(free if params.cloud == "always" else [])])) if cloud else []
+    numbers = {"cloud": cloud, "budget_px": params.contact_px, "views": views, "because": why, **numbers}
+    warnings = [f"sources: cloud = never, although {'; '.join(why)}"] if why and not cloud else []
+    return Result({"sources": Sources(cloud=cloud, views=views)}, numbers, warnings, [told(numbers, params.cloud)])
+
+
+def has_marks(facts: dict[str, Any]) -> bool:
+    """Whether a board or a marker is described: without either a cloud has no metre."""
+    return bool(facts.get("board") or facts.get("marker"))
+
+
+def by_plates_camera(facts: dict[str, Any]) -> list[str]:
+    """The plate, and ball views from elsewhere with its camera: those whose pose needs a source of its own."""
+    balls = [ball["name"] for ball in facts["ball"] if not ball.get("tripod") and not ball.get("camera")]
+    return ["plate", *balls]
+
+
+def cheap_views(
+    facts: dict[str, Any], routes: dict[str, str], photographs: dict[str, Raster], view_photos: list[Frame],
+    lens: KnownLens,
+) -> dict[str, View | str]:  # fmt: skip
+    """Pose of each view without the cloud, or why it has none."""
+    usual = knobs.Pose()
+    marked = [name for name in by_plates_camera(facts) if routes.get(name, "marker") in ("charuco", "marker")]
+    tripod = [ball["name"] for ball in facts["ball"] if ball.get("tripod") and ball["name"] not in routes]
+    found: dict[str, View | str] = {}
+    if has_marks(facts) and marked:
+        found = by_marks(
+            facts, marked, tripod, lambda name: grey(photographs[name].rgb()), view_photos, lens.camera,
+            usual.corner_sigma_px, usual.min_ambiguity,
+        )  # fmt: skip
+    stated = stated_view(facts, lens.camera, usual.corner_sigma_px)
+    return found if stated is None else {**found, "plate": stated}
+
+
+def spots_of(facts: dict[str, Any], wishes: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Feet (3,) of the objects, world; where no object is asked for, the middle of the board or of the first marker."""
+    if feet := feet_of(wishes):
+        return feet
+    middle = np.zeros(3)
+    if board := facts.get("board"):
+        middle[[0, 2]] = np.array(board["squares"]) * board["square_m"] / 2
+    return {"board" if facts.get("board") else "marker": middle}
+
+
+def judged(
+    plate: View, lens: KnownLens, spots: dict[str, np.ndarray], budget_px: float
+) -> tuple[dict[str, Any], str, str]:
+    """Figures, and in words why pose or lens is not good enough; empty where it is."""
+    whole, noise = left_at(lens.camera, plate, spots)
+    numbers = {"route": plate.route, "lens": lens.source, "contact_px": whole, "contact_noise_px": noise}
+    if not whole:
+        return numbers, "", "nothing is said of it" if lens.source == "unknown" else ""
+    short = of_lens = ""
+    worst = max(noise, key=noise.__getitem__)
+    if noise[worst] > budget_px:
+        short = f"{plate.route} alone leaves {worst} uncertain by {noise[worst]:.2f} px, budget {budget_px:g}"
+    worst = max(whole, key=whole.__getitem__)
+    if lens.source == "unknown":
+        of_lens = "nothing is said of it"
+    elif lens.bettered and whole[worst] > budget_px:
+        of_lens = f"{lens.source} it leaves {worst} uncertain by {whole[worst]:.2f} px, budget {budget_px:g}"
+    return numbers, short, of_lens
+
+
+def told(numbers: dict[str, Any], asked: str) -> dict[str, Any]:
+    """The decision as evidence."""
+    why, whole = numbers["because"], numbers.get("contact_px") or {}
+    left = "; ".join(f"{value:.2f} px at {name}" for name, value in whole.items())
+    good = f"{numbers.get('route')} and the lens {numbers.get('lens')} leave {left}, budget {numbers['budget_px']:g}"
+    if numbers["cloud"]:
+        return term(True, "; ".join(why) or f"knob sources.cloud = {asked}, although {good}", "")
+    if why:
+        return term(False, f"knob sources.cloud = never, although {'; '.join(why)}", f"that; {NOT_LOOKED}")
+    return term(False, good if whole else "poses and lens are stated", f"{left or 'unknown'} (one sigma); {NOT_LOOKED}")
+
+
+def term(modelled: bool, because: str, could_cost: str) -> dict[str, Any]:
+    """A row of evidence."""
+    return {"term": "cloud of further views", "modelled": modelled, "because": because, "could_cost": could_cost}
+
+
+STAGE = Stage(
+    "sources",
+    compute,
+    knobs.Sources,
+    {
+        "facts": FACTS, "wishes": WISHES, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS,
+        "view_photos": VIEW_PHOTOS, "photographs": PHOTOGRAPHS,
+    },
+    {"sources": SOURCES},
+)  # fmt: skip
