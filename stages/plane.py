@@ -2,12 +2,13 @@
 
 The markers define the world, so the plane is ``y = 0`` exactly; what is uncertain is where the camera stands to it.
 Covariance: the plate's pose covariance turned into the plane's tilt and offset as seen from the camera. Contact: pose
-and lens covariance, with their correlation, projected to pixels at the foot of each object. Rectangle: the board and
-every point at which an object can change the light by more than ``left_out``, by its bounding sphere under the map
-(`pipeline.transport.extent`); what lies behind the plate camera is cut off. Where further views were adjusted with the
-markers, a plane is fitted to their cloud (robust, weighted) and its agreement with the markers' is tested; the markers'
-plane stays the world's. Flat surfaces that stand beside it are found in the same cloud, and are modelled where the
-objects would change them. Limits: one flat surface carries the objects; what a concave object focuses may reach
+and lens covariance, with their correlation, projected to pixels at the foot of each object; of a plate that was
+registered to a tripod view also what the turn between them leaves there, and more than a pixel is said. Rectangle: the
+board and every point at which an object can change the light by more than ``left_out``, by its bounding sphere under
+the map (`pipeline.transport.extent`); what lies behind the plate camera is cut off. Where further views were adjusted
+with the markers, a plane is fitted to their cloud (robust, weighted) and its agreement with the markers' is tested; the
+markers' plane stays the world's. Flat surfaces that stand beside it are found in the same cloud, and are modelled where
+the objects would change them. Limits: one flat surface carries the objects; what a concave object focuses may reach
 farther than the rectangle; surfaces without texture are not found.
 """
 
@@ -22,6 +23,7 @@ from pipeline.camera.contact import contact_sigma
 from pipeline.camera.lens import project
 from pipeline.camera.planes_in_cloud import flat_surfaces
 from pipeline.camera.rigid import camera_points
+from pipeline.camera.tripod_registration import motion_at, motion_said, rest_of
 from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.run.artifacts import (
     CAMERA,
@@ -66,6 +68,9 @@ def compute(
     spots = feet or {"marker": ground.mean(0)}
     elevation = elevation_deg(view, list(spots.values()))
     contact = {name: sigma for name, spot in spots.items() if np.isfinite(sigma := contact_sigma(camera, view, spot))}
+    moved = motion_at(camera, view, spots)
+    contact |= {name: float(np.hypot(contact[name], rest_of(at))) for name, at in moved.items() if name in contact}
+    warnings += motion_said(view.motion.of if view.motion else "", moved)
     covariance = plane_covariance(view)
     deviations = np.sqrt(np.diag(covariance))
     warnings += edge_on(elevation, view, list(spots.values()), float(np.hypot(*deviations[:2])), contact)
@@ -82,7 +87,7 @@ def compute(
         "contact_sigma_px": contact, "camera_height_m": height, "elevation_deg": elevation,
         "rectangle_m": [float(corners[:, 0].min()), float(corners[:, 2].min()),
                         float(corners[:, 0].max()), float(corners[:, 2].max())],
-    } | extent  # fmt: skip
+    } | extent | ({"motion_px": moved} if moved else {})  # fmt: skip
     found = plane_of_cloud(cloud, height, corners) if len(cloud.points) else None
     shown, rows, surroundings = None, None, list(proxies)
     if found is not None:

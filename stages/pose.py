@@ -45,7 +45,7 @@ from pipeline.camera.pose_report import figures, reasons
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.camera.sights import FEWEST_CORNERS, marks_in
-from pipeline.camera.tripod_registration import lender, registered, turn_said, turned
+from pipeline.camera.tripod_registration import lender, registered, turned
 from pipeline.probes.standing import standing_chi2
 from pipeline.run.artifacts import (
     CAMERA,
@@ -114,7 +114,7 @@ def compute(
         estimate = by_ball(facts, shows, estimate, photographs, cameras, params)
         refuse_named(shows, estimate, params.min_ambiguity)
         estimates[shows], views[shows] = estimate, view_of(estimate)
-        views["plate"], bare = bare_plate(shows, views[shows], photographs, camera, warnings)
+        views["plate"], bare = bare_plate(shows, views[shows], photographs, camera)
     for name in orders:
         if name not in tripod and name not in views:
             estimate = estimate_view(name, orders[name], sights.get(name), cameras[name], params)
@@ -140,16 +140,16 @@ def compute(
     return Result({"views": result, "cloud": cloud}, numbers, warnings, reasons(orders, views, list(cameras.values())))
 
 
-def bare_plate(
-    shows: str, view: View, photographs: dict[str, Raster], camera: Camera, warnings: list[str]
-) -> tuple[View, dict[str, Any]]:
-    """The pose of a plate without a board by a tripod view that shows it, and the registration's figures."""
+def bare_plate(shows: str, view: View, photographs: dict[str, Raster], camera: Camera) -> tuple[View, dict[str, Any]]:
+    """The pose of a plate without a board by a tripod view that shows it, and the registration's figures.
+
+    How far it moved where objects stand, stage plane says.
+    """
     try:
         found = registered(grey(photographs["plate"].rgb()), grey(photographs[shows].rgb()), camera)
     except NumericalError as error:
         raise NumericalError(f"plate: shows no board, and beside {shows} {error}") from error
-    warnings += turn_said(shows, found)
-    return turned(view, found), {"registered_to": shows, "registration": found.evidence}
+    return turned(view, found, shows), {"registered_to": shows, "registration": found.evidence}
 
 
 def without_marks(

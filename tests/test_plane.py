@@ -13,7 +13,7 @@ from pipeline.camera.resection import refine
 from pipeline.camera.rigid import camera_points, perturb
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.transport.extent import FAR_SEEN
-from pipeline.types import Camera, Raster, Reconstruction, View
+from pipeline.types import Camera, Motion, Raster, Reconstruction, View
 from stages import knobs, plane
 
 CAMERA = Camera(width=640, height=480, fx=700, fy=700, cx=320, cy=240)
@@ -129,6 +129,23 @@ def test_contact_agrees_with_re_estimated_poses() -> None:
     assert contact_sigma(stated_camera, view, foot) == pytest.approx(largest, rel=0.12)
     without = view_of(POSE, covariance=fit.covariance)
     assert contact_sigma(stated_camera, without, foot) > 2 * largest  # the correlation matters
+
+
+def test_what_the_tripod_did_is_told_at_the_foot() -> None:
+    """A turn is undone and said where it moved the foot by a pixel; what is left of it makes the foot less certain."""
+    rest = np.array([[1.6, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    motion = Motion(of="ball", rotation=np.array([0.003, 0, 0]), covariance=1e-10 * np.eye(3), rest=rest,
+                    rest_covariance=1e-4 * np.eye(3))  # fmt: skip
+    still, moved = (computed(FACTS, {"object": []}, {"plate": view_of(POSE, motion=one)}) for one in (None, motion))
+    at = moved.numbers["motion_px"]["marker"]
+    assert at["shift_px"] == pytest.approx(0.003 * 700, rel=0.01)  # the board is in the middle of the frame
+    assert at["rest_px"] == pytest.approx(1.6)
+    before, after = (made.numbers["contact_sigma_px"]["marker"] for made in (still, moved))
+    assert after == pytest.approx(np.hypot(before, 1.6))
+    assert [text.split(",")[0] for text in moved.warnings if text.startswith("plate")] == [
+        "plate: between ball", "plate: still things are 1.60 +- 0.01 px off a turn at marker"
+    ]  # fmt: skip
+    assert "motion_px" not in still.numbers
 
 
 @pytest.mark.parametrize(("tilt", "outcome"), [(80, "fine"), (87, "warned"), (89.5, "refused")])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from printed_board import BOARD, charuco_print, looking_at, photograph
 
-from pipeline.camera.lens import pixel_rays
-from pipeline.camera.rigid import difference, rotation_exp
-from pipeline.camera.tripod_registration import registered
+from pipeline.camera.lens import pixel_rays, project
+from pipeline.camera.rigid import camera_points, difference, rotation_exp
+from pipeline.camera.tripod_registration import motion_at, motion_said, registered, rest_of, turned
 from pipeline.run.errors import NumericalError
-from pipeline.types import Camera, Raster, Reconstruction, Result
+from pipeline.types import Camera, Raster, Reconstruction, Result, View
 from stages import knobs, pose
 
 CAMERA = Camera(width=480, height=360, fx=640, fy=640, cx=242.3, cy=178.1, distortion=np.array([-0.1, 0.02, 0, 0, 0]))
@@ -104,8 +104,37 @@ def test_a_bare_plate_is_placed_by_the_tripod(px: float) -> None:
     numbers = result.numbers["plate"]
     assert numbers["registered_to"] == "ball"
     assert numbers["registration"]["shift_px"] == pytest.approx(np.hypot(0.6, 0.8) * px, abs=0.15 * px + 0.05)
-    said = [text for text in result.warnings if "the camera turned by" in text]
-    assert len(said) == (1 if px > 1 else 0)
+    spot = np.array([0.16, 0, 0.05])
+    moved = motion_at(CAMERA, views["plate"], {"cup": spot})
+    shown = [project(CAMERA, camera_points(at, spot[None])[0])[0] for at in (truth, BOARD_FROM)]
+    assert abs(moved["cup"]["shift_px"] - np.linalg.norm(shown[0] - shown[1])) < 4 * moved["cup"]["sigma_px"] + 0.01
+    assert moved["cup"]["sigma_px"] < 0.1
+    assert rest_of(moved["cup"]) == 0  # a turn is all there was
+    said = motion_said(views["plate"].motion.of, moved)
+    assert [text.split(" turned by ")[0] for text in said] == (
+        ["plate: between ball, which shows the board, and the plate the camera"] if px > 1 else []
+    )
+
+
+def test_what_a_turn_leaves_is_told_where_objects_stand() -> None:
+    """The zoom was touched by 0.8 %: no turn undoes that, and it grows with the distance from the middle."""
+    scene = far_scene(7)
+    plate = shot(scene, np.zeros(3), 0.01, 1)
+    other = shot(lambda rays: scene(rays * (1, 1, 1.008)), np.zeros(3), 0.01, 2)
+    found = registered(plate, other, CAMERA)
+    stood = looking_at(np.zeros(3), 30, 0, 0.6)
+    view = View(world_from_camera=stood, covariance=1e-8 * np.eye(6), route="charuco", rms_px=0, points=24)
+    px = np.array([[242.3, 178.1], [430.0, 320.0]])
+    rays = pixel_rays(CAMERA, px) @ stood[:3, :3].T
+    spots = dict(zip(("middle", "corner"), stood[:3, 3] - rays * (stood[1, 3] / rays[:, 1:2]), strict=True))
+    moved = motion_at(CAMERA, turned(view, found, "ball"), spots)
+    # where the other photograph shows the same ray; the affine field is that of a lens without its bend to 0.02 px
+    true = np.linalg.norm(px[1] - px[0]) * 0.008
+    assert moved["corner"]["rest_px"] == pytest.approx(true, abs=4 * moved["corner"]["rest_sigma_px"] + 0.05)
+    assert rest_of(moved["middle"]) < 0.2
+    said = motion_said("ball", moved)
+    assert len(said) == 1
+    assert "off a turn at corner, needed below 1 px: tripod or lens was pushed after ball" in said[0]
 
 
 @pytest.mark.parametrize("px", [0.0, 3.0])

@@ -4,8 +4,9 @@ The pictures are averaged down and made even in tone; windows with texture measu
 intensity, gain and offset free (Lucas and Kanade 1981; window shifts as in Kybic and Unser 2003), starting from the
 peak of the whole pictures' phase correlation. A robust fit of one small rotation through the lens says which windows
 belong to the still scene: what was put in or taken out (ball, board, their shadows) is left out. Covariance: the
-windows' scatter about the rotation, as windows of one picture share no pixels. Limits: a rotation only, as a tripod
-that is knocked turns far more than it shifts, and what it shifted shows as scatter; turns of less than half a window.
+windows' scatter about the rotation, as windows of one picture share no pixels. What the rotation leaves is fitted by an
+affine field, with covariance, and told at the objects' feet. Limits: a rotation only is undone, as a tripod that is
+knocked turns far more than it shifts; turns of less than half a window.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import numpy as np
 
 from pipeline.camera.lens import project_jacobians, unproject
 from pipeline.camera.opencv_bridge import Sightings
-from pipeline.camera.rigid import rotation_exp, skew
+from pipeline.camera.rigid import camera_points, rotation_exp, skew
 from pipeline.run.errors import NumericalError
-from pipeline.types import Camera, View
+from pipeline.types import Camera, Motion, View
 
 LARGEST = 1.5e6  # pixels of the pictures that are compared
 WINDOW = 32  # px of them
@@ -32,15 +33,21 @@ LEAST_LIKENESS = 0.7  # correlation of a window with its place in the other pict
 GATE = 4.0
 SYSTEMATIC_PX = 0.02  # that all windows share: interpolation; 0.015 px is measured at a turn of 7 px
 FLOOR_PX = 0.02  # windows agree no better than interpolation does
-SHIFTED_PX = 1.0  # beyond it the plate is not where the board was seen
+SHIFTED_PX = 1.0  # at a foot: beyond it the plate is not where the board was seen
+CLEAR = 3.0  # standard uncertainties from which what a turn leaves is no noise
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Rotation vector (3,) rad with ``p_other = exp(rotation) p_plate`` in camera frames, and its covariance (3, 3)."""
+    """Rotation vector (3,) rad with ``p_other = exp(rotation) p_plate`` in camera frames, and its covariance (3, 3).
+
+    ``rest`` (3, 2) px and ``rest_covariance`` (3, 3): what it leaves, as in `pipeline.types.Motion`.
+    """
 
     rotation: np.ndarray
     covariance: np.ndarray
+    rest: np.ndarray
+    rest_covariance: np.ndarray
     evidence: dict[str, Any]
 
 
@@ -79,11 +86,19 @@ def registered(plate: np.ndarray, other: np.ndarray, camera: Camera) -> Registra
     normal = np.einsum("n,nki,nkj->ij", weight, turn[good], turn[good])
     covariance = np.linalg.inv(normal) + (SYSTEMATIC_PX * step / camera.fx) ** 2 * np.eye(3)
     moved = np.hypot(*(turn @ rotation).T) * step
-    return Registration(rotation, (covariance + covariance.T) / 2, {
+    along = affine(centre[good], camera)
+    rest_covariance = np.linalg.inv(along.T @ (weight[:, None] * along))
+    rest = rest_covariance @ along.T @ (weight[:, None] * (measured - turn @ rotation)[good]) * step
+    return Registration(rotation, (covariance + covariance.T) / 2, rest, rest_covariance * step**2, {
         "windows": int(good.sum()), "textured": textured, "scatter_px": float(noise * step),
         "shift_px": float(np.sqrt((moved**2).mean())), "shift_max_px": float(moved.max()),
         "chi2": float(rotation @ np.linalg.solve(covariance, rotation)),
     })  # fmt: skip
+
+
+def affine(px: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) of pixels (N, 2): 1, and x and y from the middle of the frame over its sides."""
+    return np.concatenate([np.ones((len(px), 1)), px / (camera.width, camera.height) - 0.5], -1)
 
 
 def even(picture: np.ndarray, step: int) -> np.ndarray:
@@ -178,27 +193,65 @@ def lender(sights: dict[str, Sightings], tripod: list[str], fewest: int) -> str:
     return max(shown, key=lambda name: shown[name], default="")
 
 
-def turned(view: View, found: Registration) -> View:
+def turned(view: View, found: Registration, of: str = "") -> View:
     """The pose of the registration's first picture (the plate) from the ``view`` of its second, covariances added.
 
-    Its route is "tripod". Position and lens are the other's: a tripod only turns.
+    Its route is "tripod". Position and lens are the other's: a tripod only turns. ``of``: the second's name, for the
+    record of the motion.
     """
     whole = np.eye(4)
     whole[:3, :3] = rotation_exp(found.rotation)
     covariance = view.covariance.copy()
     about = view.world_from_camera[:3, :3]
     covariance[:3, :3] += about @ found.covariance @ about.T
-    pose = view.world_from_camera @ whole
-    return view.model_copy(update={"world_from_camera": pose, "covariance": covariance, "route": "tripod"})
+    motion = Motion(of=of, rotation=found.rotation, covariance=found.covariance, rest=found.rest,
+                    rest_covariance=found.rest_covariance) if of else None  # fmt: skip
+    changed = {"covariance": covariance, "route": "tripod", "motion": motion}
+    return view.model_copy(update={"world_from_camera": view.world_from_camera @ whole, **changed})
 
 
-def turn_said(name: str, found: Registration) -> list[str]:
-    """The warning about a plate that is not where the view ``name`` showed the board; none below a pixel."""
-    shift, scatter = found.evidence["shift_px"], found.evidence["scatter_px"]
-    if shift <= SHIFTED_PX:
-        return []
-    return [
-        f"plate: the camera turned by {shift:.2f} px between {name}, which shows the board, and the plate, needed "
-        f"below {SHIFTED_PX:g} px; corrected to {scatter:.2f} px, but what a knocked tripod shifted is not: "
-        "photograph the plate again right after the board"
-    ]
+def motion_at(camera: Camera, view: View, spots: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
+    """How far the picture moved at places (3,) of the world, px, and what of it is left, each with its uncertainty.
+
+    Empty for a view that was registered to none. Uncertainties are the larger axis's.
+    """
+    moved: dict[str, dict[str, float]] = {}
+    for name, spot in spots.items() if view.motion is not None else []:
+        assert view.motion is not None
+        point = camera_points(view.world_from_camera, spot[None])[0]
+        px, by_point, _ = project_jacobians(camera, point)
+        if not np.isfinite(px).all():
+            continue
+        by_turn = by_point[0] @ -skew(point[0])
+        along = affine(px, camera)[0]
+        moved[name] = {
+            "shift_px": float(np.linalg.norm(by_turn @ view.motion.rotation)),
+            "sigma_px": float(np.sqrt(np.linalg.eigvalsh(by_turn @ view.motion.covariance @ by_turn.T)[-1])),
+            "rest_px": float(np.linalg.norm(along @ view.motion.rest)),
+            "rest_sigma_px": float(np.sqrt(along @ view.motion.rest_covariance @ along)),
+        }
+    return moved
+
+
+def rest_of(moved: dict[str, float]) -> float:
+    """What is left at a spot, px, where it is no noise; else 0."""
+    return moved["rest_px"] if moved["rest_px"] > CLEAR * moved["rest_sigma_px"] else 0.0
+
+
+def motion_said(of: str, moved: dict[str, dict[str, float]]) -> list[str]:
+    """Warnings about feet at which the plate is a pixel or more from where the view ``of`` showed the board."""
+    said = []
+    for name, at in moved.items():
+        rest = f"{at['rest_px']:.2f} +- {at['rest_sigma_px']:.2f} px"
+        if at["shift_px"] > SHIFTED_PX:
+            said.append(
+                f"plate: between {of}, which shows the board, and the plate the camera turned by "
+                f"{at['shift_px']:.2f} +- {at['sigma_px']:.2f} px at {name}, needed below {SHIFTED_PX:g}; "
+                f"undone, {rest} are left there: photograph the plate again right after the board"
+            )
+        if rest_of(at) > SHIFTED_PX:
+            said.append(
+                f"plate: still things are {rest} off a turn at {name}, needed below {SHIFTED_PX:g} px: tripod or lens "
+                f"was pushed after {of}, and objects stand wrong by as much; photograph the plate again, or add [views]"
+            )
+    return said
