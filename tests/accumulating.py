@@ -102,7 +102,7 @@ def run(one: Build) -> dict[str, str]:
 
 def always_due() -> None:
     """Every offer shown, every checkpoint written, whatever they cost."""
-    live.OFFER_EVERY_S = live.SAVE_EVERY_S = 0.0
+    live.OFFER_EVERY_S = live.SAVE_EVERY_S = live.OFFER_LEFT_S = 0.0
     live.OFFER_SHARE = live.SAVE_SHARE = 1.0
 
 

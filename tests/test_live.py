@@ -26,7 +26,7 @@ from stages.order import graph
 
 @pytest.fixture(autouse=True)
 def _always_due(monkeypatch):
-    for name in ("OFFER_EVERY_S", "SAVE_EVERY_S"):
+    for name in ("OFFER_EVERY_S", "SAVE_EVERY_S", "OFFER_LEFT_S"):
         monkeypatch.setattr(live, name, 0.0)
     for name in ("OFFER_SHARE", "SAVE_SHARE"):
         monkeypatch.setattr(live, name, 1.0)
@@ -287,6 +287,26 @@ def test_showing_takes_a_tenth_of_the_time_at_most(cost, monkeypatch, tmp_path):
     assert min(np.diff(shown)) >= 3.0
     assert (len(shown) - 1) * cost <= 0.1 * 1000
     assert max(np.diff(shown)) <= max(3.0 + cost, 10 * cost) + 0.1  # and no longer than that
+
+
+def test_a_stage_near_its_end_is_not_kept_from_it(monkeypatch, tmp_path):
+    """At a steady rate: of 60 s, what is offered (every 3 s) until 10 s are left is shown; of 9 s nothing is."""
+    monkeypatch.setattr(live, "OFFER_EVERY_S", 3.0)
+    monkeypatch.setattr(live, "OFFER_LEFT_S", 10.0)
+    assert shown_of(60.0, tmp_path)[-1] == 48.0
+    assert shown_of(9.0, tmp_path) == []
+
+
+def shown_of(seconds: float, folder: Path) -> list[float]:
+    """When a stage of so many seconds, told and offered twenty times, is shown."""
+    clock, shown = Clock(), []
+    host = Live("toy", Stop(), folder / "c.npz", "digest", lambda *_: shown.append(clock.now - 100.0), clock)
+    for share in np.linspace(0.05, 1.0, 20):
+        clock.now = 100.0 + seconds * share
+        host.told(share)
+        host.offer(lambda: Result({}))
+    assert host.stop.patient
+    return shown
 
 
 def test_pace_follows_the_measured_cost():

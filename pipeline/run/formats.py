@@ -56,6 +56,16 @@ def write_bytes(path: Path, data: bytes) -> None:
         scratch.write_bytes(data)
 
 
+def use_threads() -> None:
+    """Let this process compress and expand EXR files on all cores; the bytes are the same.
+
+    For commands only: threads do not survive a fork, and a child that waits for them waits for ever.
+    """
+    import OpenEXR
+
+    OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+
+
 def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
     """Write a single-part scanline EXR, ZIP: uint32 and float16 arrays as they are, all others float32 (or half).
 

@@ -21,6 +21,7 @@ from pipeline.run import formats, progress
 from pipeline.types import Result
 
 OFFER_EVERY_S, OFFER_SHARE = 3.0, 0.1
+OFFER_LEFT_S = 10.0  # nearer its end a stage is not kept from it: showing the desk's costs 3 CPU s
 SAVE_EVERY_S, SAVE_SHARE = 10.0, 0.05
 DIGEST, SPENT = "insitu:digest", "insitu:spent"  # keys of the checkpoint's own beside the stage's arrays
 
@@ -89,18 +90,27 @@ class Live(progress.Host):
         self.show, self.clock, self.start = show, clock, clock()
         self.offers = Pace(OFFER_EVERY_S, OFFER_SHARE, self.start)
         self.saves = Pace(SAVE_EVERY_S, SAVE_SHARE, self.start + SAVE_EVERY_S)
-        self.shown = self.told = False
+        self.shown = self.warned = False
+        self.share = 0.0
         self.cpu_start, self.before = time.process_time(), np.zeros(2)
 
     def spent(self) -> np.ndarray:
         """(2,) wall and CPU seconds of the stage, those before the checkpoint it went on from included."""
         return self.before + np.array([self.clock() - self.start, time.process_time() - self.cpu_start])
 
+    def told(self, share: float) -> None:
+        """How far the stage is."""
+        self.share = share
+
+    def left(self) -> float:
+        """Seconds to the end at the mean rate so far; infinite while no share was told."""
+        return (self.clock() - self.start) * (1 - self.share) / self.share if self.share > 0 else np.inf
+
     def offer(self, make: Callable[[], Result]) -> None:
-        """Show the result when one is due."""
+        """Show the result when one is due, and the end is not near."""
         self.stop.patient = True
         start = self.clock()
-        if not self.offers.due(start) or self.interrupted():
+        if not self.offers.due(start) or self.left() < OFFER_LEFT_S or self.interrupted():
             return
         self.show(make(), self._seen)
         self.offers.spent(start, self.clock())
@@ -113,9 +123,9 @@ class Live(progress.Host):
 
     def interrupted(self) -> bool:
         """Whether the user asked to stop; says once that this was heard."""
-        if self.stop.asked and not self.told:
+        if self.stop.asked and not self.warned:
             progress.log.info("%s: stopping, what there is will be kept; once more stops at once", self.name)
-            self.told = True
+            self.warned = True
         return self.stop.asked
 
     def checkpoint_load(self) -> progress.Arrays | None:

@@ -26,6 +26,9 @@ log = logging.getLogger("insitu.progress")
 class Host:
     """Who listens to the stage at hand. This one, outside a run, hears nothing and never interrupts."""
 
+    def told(self, share: float) -> None:
+        """See `report`."""
+
     def offer(self, make: Callable[[], Result]) -> None:
         """See `offer`."""
 
@@ -58,14 +61,16 @@ def hosted(host: Host) -> Iterator[None]:
 def report(what: str, share: float) -> None:
     """Say that ``share`` (0 to 1) of ``what`` is done. Not shares of several tasks in turn: one task, one name."""
     log.info("%s", what, extra={"share": share})
+    _host.get().told(share)
 
 
 def offer(make: Callable[[], Result]) -> None:
     """Offer what the stage would return if it ended now: every output, whole, of its final size.
 
     ``make`` is called only when someone will look, so offer as often as results improve. The first offer always goes
-    through; later ones when seconds have passed and showing them stays within a tenth of the stage's time. A stage
-    that has offered is asked by `interrupted` instead of being broken off.
+    through; later ones when seconds have passed and showing them stays within a tenth of the stage's time. None does
+    when, by the share that was reported, the stage is done in seconds anyway. A stage that has offered is asked by
+    `interrupted` instead of being broken off.
     """
     _host.get().offer(make)
 

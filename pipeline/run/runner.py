@@ -168,7 +168,7 @@ class Build:
         outputs = {}
         for artifact in stage.outputs.values():
             outputs[artifact.name] = formats.digest(formats.write(folder, artifact, values[artifact.name]))
-            self.memory[artifact.name] = outputs[artifact.name], values[artifact.name]
+            self.memory[artifact.name] = outputs[artifact.name], as_read(values[artifact.name])
         spent = dict(zip(("seconds", "cpu_seconds"), live.spent().tolist(), strict=True))
         spent["peak_mb"] = memory.peak_mb()  # of the whole process, so with what it holds of earlier stages
         measured = {"numbers": result.numbers, "warnings": result.warnings, "evidence": result.evidence}
@@ -227,7 +227,7 @@ class Build:
                 except BlockingIOError:
                     return
             inputs = {
-                argument: values[artifact.name] if artifact.name in values else self.value(artifact)
+                argument: as_read(values[artifact.name]) if artifact.name in values else self.value(artifact)
                 for argument, artifact in follower.inputs.items()
             }
             params = self.knobs[follower.name].model_validate(self.settings.params[follower.name])
@@ -280,7 +280,7 @@ def settled(stage: Stage, result: Result) -> dict[str, Any]:
 
 
 def settle(artifact: Artifact, value: Any) -> Any:
-    """The value exactly as a later process would read it back, so that one process and many give the same bytes."""
+    """The value as it is written; `as_read` of it is what a later process reads back."""
     if artifact.kind == "json":
         adapter = TypeAdapter(artifact.type)
         return adapter.validate_json(adapter.dump_json(value))
@@ -292,12 +292,27 @@ def settle(artifact: Artifact, value: Any) -> Any:
 
 
 def settle_raster(raster: Raster) -> Raster:
-    """Channels as float32 or uint32, contiguous."""
-    channels = {
-        name: np.ascontiguousarray(values, np.uint32 if values.dtype.kind in "ub" else np.float32)
-        for name, values in raster.channels.items()
+    """Channels as float32, uint32 or, where the stage chose it, float16; contiguous."""
+    channels: dict[str, np.ndarray] = {
+        name: np.ascontiguousarray(values, _stored_type(values)) for name, values in raster.channels.items()
     }
     return Raster(channels, raster.space, raster.attributes)
+
+
+def _stored_type(values: np.ndarray) -> type:
+    if values.dtype == np.float16:
+        return np.float16
+    return np.uint32 if values.dtype.kind in "ub" else np.float32
+
+
+def as_read(value: Any) -> Any:
+    """A settled value exactly as a later process reads it back: one process and many come to the same bytes."""
+    if isinstance(value, Raster):
+        wide = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in value.channels.items()}
+        return Raster(wide, value.space, value.attributes)
+    if isinstance(value, dict) and any(isinstance(part, Raster) for part in value.values()):
+        return {name: as_read(part) for name, part in value.items()}
+    return value
 
 
 def _plain(value: Any) -> Any:
