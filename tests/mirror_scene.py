@@ -54,6 +54,8 @@ class Place:
     radius: float = 0.04
     reflectance: float | tuple[float, float, float] | Mirror = 0.8
     dent: Dent | None = None  # the ball is R (1 + height); slopes to first order
+    glass: float | None = None  # thickness before the mirror, of the radius; ``reflectance`` is then the silver's
+    index: float = 1.52
 
     def radiance(self, origin: np.ndarray, w: np.ndarray) -> np.ndarray:
         """RGB (N, 3) seen from ``origin`` (N, 3) along ``w`` (N, 3), the ball left out."""
@@ -89,6 +91,9 @@ class Place:
             size = self.radius * (1 + self.dent(normal)[0])
             point = origin + (along - np.sqrt(np.maximum(size**2 - (to_ball**2).sum(1) + along**2, 0)))[:, None] * w
             normal = _unit(point - self.ball)
+        if self.glass is not None:
+            rgb[hit] = self.behind_glass(point, normal, w)
+            return rgb
         body = normal
         if self.dent is not None:
             normal = _unit(normal - self.dent(normal)[1])
@@ -98,6 +103,42 @@ class Place:
         reflectance = given(body, np.clip(cosine, 0, 1)) if callable(given) else np.asarray(given)
         rgb[hit] = reflectance * self.radiance(point, mirrored)
         return rgb
+
+    def behind_glass(self, point: np.ndarray, normal: np.ndarray, w: np.ndarray, orders: int = 6) -> np.ndarray:
+        """RGB (N, 3) of rays ``w`` (N, 3) that meet a glass ball at ``point``: Snell, Fresnel, mirror, ray by ray."""
+        ball = np.asarray(self.ball)
+        front, within = snell(w, normal, 1.0, self.index)
+        rgb = front[:, None] * self.radiance(point, w - 2 * (w * normal).sum(1, keepdims=True) * normal)
+        carried = (1 - front)[:, None] * np.asarray(self.reflectance)
+        for _ in range(orders):
+            inner = meets(point, within, ball, self.radius * (1 - self.glass), first=True)
+            outward = _unit(inner - ball)
+            within = within - 2 * (within * outward).sum(1, keepdims=True) * outward
+            point = meets(inner, within, ball, self.radius, first=False)
+            outward = _unit(point - ball)
+            back, out = snell(within, -outward, self.index, 1.0)
+            rgb += carried * (1 - back)[:, None] * self.radiance(point, out)
+            carried = carried * back[:, None] * np.asarray(self.reflectance)
+            within = within - 2 * (within * outward).sum(1, keepdims=True) * outward
+        return rgb
+
+
+def snell(w: np.ndarray, normal: np.ndarray, before: float, behind: float) -> tuple[np.ndarray, np.ndarray]:
+    """Fresnel's unpolarised reflectance (N,) and refracted unit directions (N, 3); ``normal`` against the rays."""
+    ratio = before / behind
+    cosine = -(w * normal).sum(1)
+    inside = np.sqrt(1 - ratio**2 * (1 - cosine**2))
+    out = ratio * w + (ratio * cosine - inside)[:, None] * normal
+    s = (before * cosine - behind * inside) / (before * cosine + behind * inside)
+    p = (behind * cosine - before * inside) / (behind * cosine + before * inside)
+    return 0.5 * (s**2 + p**2), out
+
+
+def meets(origin: np.ndarray, w: np.ndarray, centre: np.ndarray, radius: float, first: bool) -> np.ndarray:
+    """Points (N, 3) where rays meet a sphere, the first or the last of both."""
+    along = ((centre - origin) * w).sum(1)
+    half = np.sqrt(radius**2 - ((centre - origin) ** 2).sum(1) + along**2)
+    return origin + (along - half if first else along + half)[:, None] * w
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

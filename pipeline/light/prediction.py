@@ -16,6 +16,7 @@ from pipeline.conventions import (
 )
 from pipeline.image.metrics import box
 from pipeline.light.sampling import bilinear, planes
+from pipeline.probes.glass import Glass
 from pipeline.probes.reflection import directions_from_rays
 from pipeline.transport.conductors import GRAZING, reflectance_at
 from pipeline.types import BallFit, Camera, Plane
@@ -64,7 +65,8 @@ def ball_directions(
     """
     px = pixel_centres(rows, columns)
     rays = pixel_rays(camera, px.reshape(-1, 2))
-    away = directions_from_rays(rays, ball.centre_camera_m, ball.radius_m)
+    glass = Glass(ball.glass) if ball.glass > 0 else None
+    away = directions_from_rays(rays, ball.centre_camera_m, ball.radius_m, glass)
     normal = away - rays
     normal = ball.radius_m * normal / np.linalg.norm(normal, axis=-1, keepdims=True) @ world_from_camera[:3, :3].T
     mirrored = away @ world_from_camera[:3, :3].T
@@ -81,6 +83,8 @@ def ball_directions(
 
 def ball_reflectance(ball: BallFit, sine: np.ndarray) -> np.ndarray:
     """Reflectance (..., 3) of a ball under incidences of this ``sine`` (...); head on where it is NaN."""
+    if ball.glass > 0:
+        return Glass(ball.glass).total(ball.reflectance, np.nan_to_num(sine))
     if ball.edge_tint is None:
         return np.broadcast_to(ball.reflectance, (*sine.shape, 3))
     cosine = np.sqrt(np.clip(1 - np.nan_to_num(sine) ** 2, 0, 1))

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.conventions import transform_points
 from pipeline.probes import plane_image, sphere_fit
 from pipeline.probes.finding import Found, height_prior
+from pipeline.probes.glass import MOST, Glass
 from pipeline.probes.sphere_fit import SphereFit
 from pipeline.types import Camera, Raster, View
 
@@ -29,17 +30,19 @@ RADIUS_ROUNDS, FIRST_SLOPE, SETTLED = 6, -8.0, 3e-4
 
 
 def anchored_radius(
-    fit: SphereFit, photograph: Raster, camera: Camera, view: View, radius: float
+    fit: SphereFit, photograph: Raster, camera: Camera, view: View, radius: float, glass_m: float | None = None
 ) -> tuple[float, float] | None:
     """Radius [m] and its standard uncertainty of a ball on the plane, by the plane's mirror image; None where it fails.
 
     ``fit`` has the outline, for an assumed ``radius``. For a radius that is too large by a millimetre the image puts
     the centre 5 to 10 mm too low under the plane's height for it, so that the height, which is known, gives the radius
-    (secant method). Pose's errors are in the sigma of both, as if they were independent.
+    (secant method). ``glass_m`` [m] is before the mirror. Pose's errors are in the sigma of both, as if they were
+    independent.
     """
     centre, slope, before = fit.centre, FIRST_SLOPE, None
     for _ in range(RADIUS_ROUNDS):
-        aligned = plane_image.align(photograph, camera, view, centre, radius, fit.blur_px)
+        glass = None if glass_m is None else Glass(min(glass_m / radius, MOST))
+        aligned = plane_image.align(photograph, camera, view, centre, radius, fit.blur_px, glass)
         if aligned is None:
             return None
         height = height_prior(view, radius)
@@ -58,12 +61,12 @@ def anchored_radius(
 
 
 def anchored(
-    ball: Found, photograph: Raster, camera: Camera, view: View, radius: float
+    ball: Found, photograph: Raster, camera: Camera, view: View, radius: float, glass: Glass | None = None
 ) -> tuple[Found, dict[str, Any]]:
     """The ball with its centre joined with the mirrored plane's, and what that measured; as it was where it cannot."""
     if not ball.on_plane:
         return ball, {"used": False, "why": "the ball is not on the plane"}
-    aligned = plane_image.align(photograph, camera, view, ball.fit.centre, radius, ball.fit.blur_px)
+    aligned = plane_image.align(photograph, camera, view, ball.fit.centre, radius, ball.fit.blur_px, glass)
     if aligned is None:
         return ball, {"used": False, "why": "too little of the plane's texture is mirrored"}
     centre, covariance = aligned.centre, aligned.covariance

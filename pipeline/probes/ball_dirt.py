@@ -92,7 +92,7 @@ def _predicted(
 
     distance = float(np.linalg.norm(sight.centre))
     local = directions @ sight.world_from_camera[:3, :3]
-    rays, sine = rays_from_directions(local, -sight.centre / distance, sight.radius / distance)
+    rays, sine = rays_from_directions(local, -sight.centre / distance, sight.radius / distance, sight.glass)
     size = sight.camera.fx * sight.radius / distance
     reach = int(np.ceil(np.sqrt(2) / NEAR_RADII * size / 2))  # half the angle, on the ball
     px = project(sight.camera, np.nan_to_num(rays, nan=1.0))

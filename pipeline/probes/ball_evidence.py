@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, neighbourhood,
 from pipeline.probes.ball_shape import Dents
 from pipeline.probes.ball_surface import Measured, Surface, decide, measure, plane_blocks
 from pipeline.probes.finding import Found
+from pipeline.probes.glass import Glass
 from pipeline.probes.observation import Shots, ViewMap
 from pipeline.transport.conductors import preset
 from pipeline.types import Raster
@@ -30,12 +31,19 @@ class BallEvidence:
     evidence: list[dict[str, Any]] = field(default_factory=list)
 
 
-def examine(shots: Shots, found: dict[str, Found], radius: float, rim: float) -> BallEvidence:
+def examine(
+    shots: Shots, found: dict[str, Found], radius: float, rim: float, glass: Glass | None = None
+) -> BallEvidence:  # fmt: skip
     """The ball that was found in some views; ``rim``: outermost radius that is used, as a fraction."""
     facts = shots.facts["probe"]
     sights = {
         name: neighbourhood(
-            shots.photographs[name], shots.camera_of(name), shots.views[name].world_from_camera, ball.fit.centre, radius
+            shots.photographs[name],
+            shots.camera_of(name),
+            shots.views[name].world_from_camera,
+            ball.fit.centre,
+            radius,
+            glass,
         )
         for name, ball in found.items()
     }
@@ -43,8 +51,9 @@ def examine(shots: Shots, found: dict[str, Found], radius: float, rim: float) ->
     given = given_reflectance(facts)
     material = facts.get("material")
     tint = None if material is None else preset(material)[1]
-    measured = measure(list(pairs.values()), tint)
+    measured = measure(list(pairs.values()), tint if glass is None else glass)
     surface, warnings = decide(given, material, measured)
+    surface = surface if glass is None else replace(surface, glass=glass, tint=None)
     shapes = {name: shots.photographs[name].shape for name in found}
     dented = {}
     for name, sight in sights.items():
@@ -69,8 +78,8 @@ class Shaped:
     evidence: list[dict[str, Any]]
 
 
-def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_m: float | None, radius: float) -> Shaped:
-    """What dents, and glass of this thickness [m] before the mirror, do to the maps of the views.
+def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_sigma: float = 0.0) -> Shaped:
+    """What dents, and glass whose thickness leaves directions open by ``glass_sigma`` [rad], do to the views' maps.
 
     Dents are one ball's, so the view that shows most of them speaks for all; two views that agree better than that
     refute it. Directions that are off by more than `ball_shape.TOO_DENTED` leave nine harmonics and no more.
@@ -84,18 +93,7 @@ def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_m: float | N
     sigma = min([sigma, *seen])
     numbers["second_view_direction_deg"] = {name: float(np.degrees(value)) for name, value in bounds.items()}
     evidence = [dent_reason(dented, sigma, seen)]
-    glass = 0.0
-    if glass_m is not None:
-        sine = np.sqrt((np.arange(200) + 0.5) / 200) * 0.97
-        ways = ball_shape.glass_displacement(sine, min(glass_m / radius, 0.5))
-        glass = float(np.sqrt((ways**2).mean()))
-        numbers["glass_displacement_deg"] = {"rms": float(np.degrees(glass)), "rim": float(np.degrees(ways[-1]))}
-        warnings.append(
-            f"probe.glass_mm: the silvered back mirrors directions {np.degrees(glass):.2f} degrees rms from where the "
-            "front would, more towards the rim, and the glass itself mirrors 4 %, undisplaced; the variance has the "
-            "first, the map neither"
-        )
-    total = float(np.hypot(sigma, glass))
+    total = float(np.hypot(sigma, glass_sigma))
     numbers["direction_sigma_deg"] = float(np.degrees(total))
     too_dented = total > ball_shape.TOO_DENTED
     if sigma > 0:
@@ -233,7 +231,7 @@ def surface_reasons(surface: Surface, measured: Measured | None) -> list[dict[st
     """Which terms of the reflectance are in, and why."""
     angle = {
         "term": "angle dependence of the ball's reflectance",
-        "modelled": surface.tint is not None,
+        "modelled": surface.tint is not None or surface.glass is not None,
         "because": "too little of the plane is seen in the ball to test it",
         "could_cost": "3 % at 70 degrees of incidence on a ball of 0.9, 10 % on chrome; nothing head on",
     }

@@ -8,7 +8,7 @@ exposure, since both stand in one photograph.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from pipeline.camera.lens import pixel_rays, project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes import sphere_fit
+from pipeline.probes.glass import Glass, leaving
 from pipeline.probes.observation import lookup_channels
 from pipeline.types import Camera, Raster
 
@@ -32,6 +33,7 @@ class Sight:
     """One view of the ball: its picture (H, W, 8) as `lookup_channels` has it, lens, pose, centre in its frame [m].
 
     The picture may be a part of the photograph, in larger pixels: ``corner`` column and row, and ``binned`` pixels.
+    ``glass`` before the mirror, if any.
     """
 
     picture: np.ndarray
@@ -41,6 +43,7 @@ class Sight:
     radius: float
     corner: tuple[int, int] = (0, 0)
     binned: int = 1
+    glass: Glass | None = None
 
 
 @dataclass(frozen=True)
@@ -75,8 +78,9 @@ class Pairs:
 
 
 def neighbourhood(
-    photograph: Raster, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float
-) -> Sight:
+    photograph: Raster, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float,
+    glass: Glass | None = None,
+) -> Sight:  # fmt: skip
     """The ball and the plane around it, as far as `FARTHEST`; binned when the ball is larger than needed."""
     size = np.array([camera.width, camera.height])
     outline = sphere_fit.silhouette(camera, centre, radius, AROUND)[0]
@@ -97,8 +101,9 @@ def neighbourhood(
         "cy": (camera.cy - int(low[1])) / binned, "width": int(shape[0]), "height": int(shape[1]),
     }  # fmt: skip
     return Sight(
-        found, camera.model_copy(update=moved), world_from_camera, centre, radius, (int(low[0]), int(low[1])), binned
-    )
+        found, camera.model_copy(update=moved), world_from_camera, centre, radius, (int(low[0]), int(low[1])), binned,
+        glass,
+    )  # fmt: skip
 
 
 def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: int | None = None) -> Pairs:
@@ -128,6 +133,8 @@ def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: i
     fine = (px[:, None] + 0.5 + np.stack([dx, dy], -1)).reshape(-1, 2)
     _, _, _, there = ball_points(sight, fine)
     found, seen = _direct(picture, camera, world_from_camera, centre, radius, there)
+    if sight.glass is not None and sight.glass.thickness != 0:
+        found = _with_ghosts(sight, fine, found, picture[px[:, 1], px[:, 0], :3])
     found = found.reshape(len(px), -1, 8)
     own = picture[px[:, 1], px[:, 0]].astype(float)
     good = seen.reshape(len(px), -1).all(1) & (own[:, 6] > 0.999) & (own[:, 7] == 0)
@@ -142,11 +149,36 @@ def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: i
     return Pairs(px, sine, point, own[:, :3], own[:, 3:6], direct, variance, texture, slope, tilt, azimuth).at(good)
 
 
+def _with_ghosts(sight: Sight, px: np.ndarray, found: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
+    """Direct values (N, 8) of pixels (N, 2) with what the glass's ghosts show mixed in, by their shares.
+
+    ``mirrored`` (M, 3) of the ball's pixels, for its reflectance. Where a ghost's point is not seen, the pixel's own.
+    """
+    assert sight.glass is not None
+    rays = len(px) // len(mirrored)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = mirrored / found[:, :3].reshape(-1, rays, 3).mean(1)
+    usable = np.isfinite(ratio).all(1)
+    facing = np.clip(np.median(ratio[usable], 0), 0.05, 1) if usable.any() else np.ones(3)
+    sine = np.minimum(np.nan_to_num(ball_points(sight, px)[1]), 1)
+    mixed = found.copy()
+    for order, share in zip((0, 2), sight.glass.ghosts(facing, sine), strict=True):
+        ghost = replace(sight, glass=replace(sight.glass, order=order))
+        there = ball_points(ghost, px)[3]
+        values, seen = _direct(
+            sight.picture, sight.camera, sight.world_from_camera, sight.centre, sight.radius, np.nan_to_num(there)
+        )
+        seen &= np.isfinite(there).all(1) & (values[:, 6] > 0.999) & (values[:, 7] == 0)
+        mixed[:, :3] += np.where(seen[:, None], share * (values[:, :3] - found[:, :3]), 0)
+    return mixed
+
+
 def ball_points(sight: Sight, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of pixels (N, 2), in the world: outward normal of the ball (N, 3), sine of the incidence (N,), reflected unit
     direction (N, 3), and point of y = 0 that it meets (N, 3).
 
-    NaN where the ball is not hit; the point also where the direction does not go down.
+    NaN where the ball is not hit; the point also where the direction does not go down. Of a glass ball the normal is
+    that where the ray enters.
     """
     centre, radius, world_from_camera = sight.centre, sight.radius, sight.world_from_camera
     rays = pixel_rays(sight.camera, px)
@@ -156,6 +188,9 @@ def ball_points(sight: Sight, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     normal = (hit - centre) / radius
     away = rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
     sine = np.linalg.norm(np.cross(rays, normal), axis=-1)
+    if sight.glass is not None:
+        outward, away = leaving(sight.glass, rays, normal)
+        hit = centre + radius * outward
     rotation, position = world_from_camera[:3, :3], world_from_camera[:3, 3]
     start, away = hit @ rotation.T + position, away @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):

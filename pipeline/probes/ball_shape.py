@@ -32,7 +32,6 @@ MIN_PATCHES = 8
 FLOOR_PX = 0.3  # of a perfect ball: on ray-traced ones 0.1, on two demosaicked captures 0.2 to 0.3
 SIGNIFICANT, OPEN_SIGMA = 3.0, 3.0
 TOO_DENTED = 0.1  # rad: of order l, exp(-l (l + 1) s^2 / 2) is left: 97 % of order 2, half of order 11
-GLASS_INDEX = 1.52  # soda-lime
 COMPARED_ROWS, HORIZON = 128, 0.1
 
 
@@ -147,7 +146,8 @@ def dents(
     arm = (centre + 0.5 - project(sight.camera, sight.centre[None])[0]) / radius_px
     sine = np.clip(np.linalg.norm(arm, axis=1), 1e-3, 0.97)
     outward = arm / np.linalg.norm(arm, axis=1)[:, None]
-    radial, across = radians_per_pixel(sine, sight.radius / float(np.linalg.norm(sight.centre)), radius_px)
+    ratio = sight.radius / float(np.linalg.norm(sight.centre))
+    radial, across = radians_per_pixel(sine, ratio, radius_px, sight.glass)
     along = (shift * outward).sum(1) * radial
     beside = (shift[:, 0] * outward[:, 1] - shift[:, 1] * outward[:, 0]) * across
     angle = float(np.sqrt(np.median(along**2 + beside**2) / np.log(2)))
@@ -225,16 +225,6 @@ def second_view_sigma(one: ViewMap, other: ViewMap) -> float:
     area = latlong_solid_angles(rows, 2 * rows)
     excess = float(((difference**2 - noise) * area)[used].sum())
     return float(np.sqrt(max(excess, 0) / max(float((slope**2 * area)[used].sum()), 1e-30)))
-
-
-def glass_displacement(sine: np.ndarray, thickness: float, index: float = GLASS_INDEX) -> np.ndarray:
-    """Angle [rad] between what the silvered back of a glass ball mirrors and what its front would, by incidence.
-
-    ``thickness`` as a fraction of the outer radius R. Snell's law at R and the sine rule down to R - t: between entry
-    and back the way turns by ``asin(s / (n (1 - t))) - asin(s / n)`` about the centre, once in and once out.
-    """
-    inner = np.clip(np.asarray(sine) / (index * (1 - thickness)), 0, 1)
-    return np.asarray(2 * (np.arcsin(inner) - np.arcsin(np.asarray(sine) / index)))
 
 
 def unsure(view: ViewMap, sigma: float) -> ViewMap:

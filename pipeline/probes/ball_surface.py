@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.probes.ball_pairs import Pairs
+from pipeline.probes.glass import Glass
 from pipeline.transport.conductors import GRAZING, preset, reflectance_at
 
 GIVEN_SIGMA = 0.02  # relative, of numbers in a manifest: reflectances are quoted to a percent or two
@@ -34,17 +35,21 @@ TINTS = np.linspace(0.7, 1.05, 15)  # of the third rung
 
 @dataclass(frozen=True)
 class Surface:
-    """Reflectance head on ``facing`` (3,), ACEScg, with relative ``sigma`` (3,); ``tint`` (3,) None: at all angles."""
+    """Reflectance head on ``facing`` (3,), ACEScg, with relative ``sigma`` (3,); ``tint`` (3,) None: at all angles.
+
+    Behind ``glass`` its Fresnel reflection, not a metal's, makes the angle dependence.
+    """
 
     facing: np.ndarray
     sigma: np.ndarray
     tint: np.ndarray | None = None
     source: str = "given"
+    glass: Glass | None = None
 
     def at(self, sine: np.ndarray) -> np.ndarray:
         """Reflectance (..., 3) under incidences of this ``sine`` (...); NaN counts as 0."""
         cosine = np.sqrt(np.clip(1 - np.nan_to_num(np.asarray(sine, float)) ** 2, 0, 1))
-        return _at(self.facing, self.tint, cosine)
+        return _at(self.facing, self.tint if self.glass is None else self.glass, cosine)
 
 
 @dataclass(frozen=True)
@@ -66,20 +71,22 @@ class Measured:
     scale: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def _at(facing: np.ndarray, tint: np.ndarray | float | None, cosine: np.ndarray) -> np.ndarray:
+def _at(facing: np.ndarray, tint: np.ndarray | float | Glass | None, cosine: np.ndarray) -> np.ndarray:
     """Reflectance (..., 3) at a cosine (...)."""
+    if isinstance(tint, Glass):
+        return tint.total(facing, np.sqrt(np.clip(1 - cosine**2, 0, 1)))
     if tint is None:
         return np.broadcast_to(facing, (*np.shape(cosine), 3)).astype(float)
     edge = (facing + (1 - facing) * (1 - GRAZING) ** 5) * tint
     return reflectance_at(facing, edge, cosine)
 
 
-def measure(views: list[Pairs], tint: np.ndarray | None = None) -> Measured | None:
+def measure(views: list[Pairs], tint: np.ndarray | Glass | None = None) -> Measured | None:
     """Reflectance from the pairs of all views; None when too little of the plane is seen both ways.
 
-    ``tint`` (3,) of a known metal replaces the ladder. Standard uncertainties are those of blocks (sectors about the
-    foot, near and far, of each view), so what neighbouring pixels share is not counted twice. Any surface that is seen
-    both ways can be added as pairs of its own: a card, a wall.
+    ``tint`` (3,) of a known metal, or glass, replaces the ladder. Standard uncertainties are those of blocks (sectors
+    about the foot, near and far, of each view), so what neighbouring pixels share is not counted twice. Any surface
+    that is seen both ways can be added as pairs of its own: a card, a wall.
     """
     whole = _joined(views)
     block = plane_blocks(views)
@@ -205,7 +212,7 @@ def _robust(
     return coefficients, float(np.sqrt(covariance[0, 0])), scatter
 
 
-def _climb(data: _Data, tint: np.ndarray | None) -> tuple[Any, bool, list[dict[str, Any]]]:
+def _climb(data: _Data, tint: np.ndarray | Glass | None) -> tuple[Any, bool, list[dict[str, Any]]]:
     """Tint (None, 1, one number, or the metal's), whether gloss is a term, and a row per trial."""
     _, _, scatter = data.fit(tint, False)
     tests: list[dict[str, Any]] = []

@@ -18,11 +18,13 @@ from pipeline.probes.anchor import anchored, anchored_radius
 from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, refuse_cut, solve_radius
+from pipeline.probes.glass import MOST, Glass, unghosted
+from pipeline.probes.glass_thickness import GlassEvidence, judge, thickness
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.outline import part_of
 from pipeline.probes.parallax import set_down
-from pipeline.probes.reflection import blind_half_angle, deviation, radians_per_pixel
+from pipeline.probes.reflection import deviation, radians_per_pixel
 from pipeline.probes.unwrap import displaced_variance, unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import BallFit, Camera, Raster, View
@@ -46,7 +48,9 @@ class MirrorBall:
         warnings: list[str] = []
         radius, radius_sigma = radius_of(shots, names, tripod, warnings)
         clicks = {ball["name"]: ball.get("click_px") for ball in facts["ball"]}
+        stated = stated_glass(facts["probe"], radius)
         found: dict[str, Found] = {}
+        by_rim: dict[str, Found] = {}
         anchors: dict[str, dict[str, Any]] = {}
         for name in names:
             plate = photographs["plate"] if name in tripod else None
@@ -56,13 +60,20 @@ class MirrorBall:
                 radius_sigma,
             )  # fmt: skip
             warnings += complaints(name, found[name], radius)
+            by_rim[name] = found[name]
             found[name], anchors[name] = anchored(
-                found[name], photographs[name], shots.camera_of(name), views[name], radius
+                found[name], photographs[name], shots.camera_of(name), views[name], radius, stated
             )
+        glassy = glass_of(shots, by_rim, radius, stated)
+        for name in names:
+            if glassy.glass is not stated:
+                found[name], anchors[name] = anchored(
+                    by_rim[name], photographs[name], shots.camera_of(name), views[name], radius, glassy.glass
+                )
             if not anchors[name]["used"]:
                 refuse_cut(name, found[name].fit, why=f" as {anchors[name]['why']}")
-        known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM))
-        warnings += known.warnings
+        known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM), glassy.glass)
+        warnings += known.warnings + glassy.warnings
         maps = {
             name: view_map(
                 without(photographs[name], known.dirty.get(name)),
@@ -77,23 +88,67 @@ class MirrorBall:
         }
         to_camera = {name: views[name].world_from_camera[:3, 3] - found[name].centre_world for name in names}
         maps = {
-            name: set_down(view, found[name].centre_world, radius, views[name].world_from_camera[:3, 3])
+            name: set_down(view, found[name].centre_world, radius, views[name].world_from_camera[:3, 3], glassy.glass)
             for name, view in maps.items()
         }
         maps, people = photographer.shade(maps, to_camera, tripod)
-        glass = facts["probe"].get("glass_mm")
-        shaped = shape(maps, known.dents, None if glass is None else 1e-3 * float(glass), radius)
-        warnings += shaped.warnings
-        numbers: dict[str, Any] = {name: fit_numbers(found[name], radius) | people.get(name, {}) for name in names}
+        shaped = shape(maps, known.dents, glassy.direction_sigma_rad)
+        warnings += shaped.warnings + ghosts_left(maps, glassy.glass)
+        numbers: dict[str, Any] = {
+            name: fit_numbers(found[name], radius, glassy.glass) | people.get(name, {}) for name in names
+        }
         for name, anchor in anchors.items():
             numbers[name]["mirrored_plane"] = anchor
         balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
         evidence = [*reasons(found), centred(anchors), photographer.reason(people, len(maps)), *known.evidence]
+        evidence += glassy.evidence
         return Observation(
-            shaped.maps, centre, balls, numbers | known.numbers | shaped.numbers, warnings,
+            shaped.maps, centre, balls, numbers | known.numbers | shaped.numbers | glassy.numbers, warnings,
             [*evidence, *shaped.evidence], scale_sigma=known.surface.sigma, smooth_only=shaped.smooth_only,
         )  # fmt: skip
+
+
+def stated_glass(facts: dict[str, Any], radius: float) -> Glass | None:
+    """The glass of the [probe] table. Raises CaptureError when it is too thick to be before a mirror."""
+    if facts.get("glass_mm") is None:
+        return None
+    share = 1e-3 * float(facts["glass_mm"]) / radius
+    if share > MOST:
+        raise CaptureError(
+            f"probe.glass_mm: {facts['glass_mm']:g} mm is {share:.0%} of the ball's radius, needed {MOST:.0%} or less; "
+            "give the wall's thickness"
+        )
+    return Glass(share) if share > 0 else None
+
+
+def glass_of(shots: Shots, by_rim: dict[str, Found], radius: float, stated: Glass | None) -> GlassEvidence:
+    """What is known of the ball's glass: stated, or measured by the plane that the views mirror.
+
+    ``by_rim``: the balls before the mirrored plane moved them. Not measured at unknown size, which the plane's mirror
+    image was used for.
+    """
+    facts = shots.facts["probe"]
+    if facts.get("diameter_m") is None:
+        return judge(stated, {}, "at unknown size the mirrored plane tells the diameter")
+    measured = {
+        name: thickness(shots.photographs[name], shots.camera_of(name), shots.views[name], ball.fit, radius)
+        for name, ball in by_rim.items()
+        if ball.on_plane
+    }
+    known = {name: one for name, one in measured.items() if one is not None}
+    return judge(stated, known, "too little texture of the plane is seen in the ball to tell", facts.get("material"))
+
+
+def ghosts_left(maps: dict[str, ViewMap], glass: Glass | None) -> list[str]:
+    """Warns of ghosts that could not be taken away."""
+    clipped = [name for name, view in maps.items() if (view.clipped * (view.weight > 0)).max(initial=0) > 0.5]
+    if glass is None or not clipped:
+        return []
+    return [
+        f"{', '.join(clipped)}: the glass shows clipped lamps twice more, at 4 % each, up to "
+        f"{np.degrees(glass.displacement()[1]):.1f} degrees beside; only what the clipped values explain is taken away"
+    ]
 
 
 def radius_of(shots: Shots, names: list[str], tripod: set[str], warnings: list[str]) -> tuple[float, float]:
@@ -117,7 +172,9 @@ def radius_of(shots: Shots, names: list[str], tripod: set[str], warnings: list[s
             refused[name] = error
             continue
         rim_only = (by_rim[0], RIM_SIZE_FACTOR * by_rim[1])
-        solved[name] = anchored_radius(fit, photograph, camera, view, by_rim[0]) or rim_only
+        thick = shots.facts["probe"].get("glass_mm")
+        glass_m = None if thick is None else 1e-3 * float(thick)
+        solved[name] = anchored_radius(fit, photograph, camera, view, by_rim[0], glass_m) or rim_only
     if not solved:
         raise next(iter(refused.values()))
     radius, sigma, birge = averaged(np.array(list(solved.values())))
@@ -155,14 +212,17 @@ def view_map(
     fit = ball.fit
     window, part = crop(camera, fit, radius)
     rotation = invert_rigid(view.world_from_camera)[:3, :3]
-    rim = min(grid.rim, usable_rim(fit, radius))
-    mirror = Mirror(part, rotation, fit.centre, radius, rim)
+    glass = surface.glass
+    rim = min(grid.rim, usable_rim(fit, radius, glass))
+    mirror = Mirror(part, rotation, fit.centre, radius, rim, glass)
     valid, channels = lookup_planes(photograph, window)
     shown = unwrap(valid, channels, mirror, height, width)
     sine, direction = texel_directions(mirror, height, width, fit.covariance, view.covariance[:3, :3])
     reflectance = surface.at(sine).astype(np.float32)
     rgb = shown.values[..., :3] / reflectance
     photon = shown.values[..., 3:6] / reflectance**2
+    if glass is not None:
+        rgb, photon = without_ghosts(rgb, photon, shown.coverage, sine, mirror, surface)
     variance = photon * shown.spread[..., None] + displaced_variance(rgb, direction, shown.coverage)
     pixels = np.where(np.isfinite(sine), shown.pixels, 0)
     blur = PIXEL_SIGMA**2 * latlong_solid_angles(height, width) / np.maximum(pixels, 1e-6)
@@ -173,7 +233,18 @@ def view_map(
     return ViewMap(rgb, variance, trust / (1 + 100 * clipped), shown.coverage, clipped, quality)
 
 
-def usable_rim(fit: sphere_fit.SphereFit, radius: float) -> float:
+def without_ghosts(
+    rgb: np.ndarray, photon: np.ndarray, coverage: np.ndarray, sine: np.ndarray, mirror: Mirror, surface: Surface
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance and photon variance (H, W, 3) of the mirror behind the glass alone."""
+    assert surface.glass is not None
+    away = mirror.rotation.T @ mirror.axis
+    light, _ = unghosted(rgb, coverage, sine, away, surface.glass, surface.facing)
+    shares = surface.glass.ghosts(surface.facing, np.nan_to_num(sine))
+    return light.astype(np.float32), (photon / (1 - shares[0] - shares[1]) ** 2).astype(np.float32)
+
+
+def usable_rim(fit: sphere_fit.SphereFit, radius: float, glass: Glass | None = None) -> float:
     """Outermost radius that is worth using, as a fraction of the silhouette's; at least MIN_RIM.
 
     Towards the silhouette a pixel spans ever more of the world: `radians_per_pixel` grows without bound. A ring is kept
@@ -188,8 +259,8 @@ def usable_rim(fit: sphere_fit.SphereFit, radius: float) -> float:
     aside = 0.5 * max(float(np.trace(fit.covariance)) - along, 0.0)
     edge = per_metre * float(np.sqrt(aside + ratio**2 * along))
     rim = np.linspace(MIN_RIM, 1, 2000, endpoint=False)
-    sigma = radians_per_pixel(rim, ratio, fit.radius_px)[0] * np.hypot(edge, PIXEL_SIGMA)
-    unseen = np.pi - deviation(rim, ratio)
+    sigma = radians_per_pixel(rim, ratio, fit.radius_px, glass)[0] * np.hypot(edge, PIXEL_SIGMA)
+    unseen = np.pi - deviation(rim, ratio, glass)
     margin = EDGE_PX + fit.blur_px + 3 * edge
     good = (3 * sigma < unseen) & (rim < 1 - margin / fit.radius_px)
     return float(rim[good].max(initial=MIN_RIM))
@@ -221,10 +292,11 @@ def crop(camera: Camera, fit: sphere_fit.SphereFit, radius: float) -> tuple[tupl
     return (slice(low[1], high[1]), slice(low[0], high[0])), part_of(camera, low, high)
 
 
-def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
+def fit_numbers(ball: Found, radius: float, glass: Glass | None = None) -> dict[str, Any]:
     """Figures of one fitted ball."""
     fit, distance = ball.fit, float(np.linalg.norm(ball.fit.centre))
     gap, gap_sigma = discrepancy(ball, radius)
+    blind = np.pi - float(deviation(np.array(1.0), radius / distance, glass))
     return {
         "centre_world_m": ball.centre_world.tolist(),
         "centre_sigma_mm": (1e3 * np.sqrt(np.diag(fit.covariance))).tolist(),
@@ -233,7 +305,7 @@ def fit_numbers(ball: Found, radius: float) -> dict[str, Any]:
         "rim_blur_px": fit.blur_px, "outline_support": fit.support, "outline_contrast": fit.contrast,
         "outline_in_frame": fit.visible, "height_discrepancy_mm": 1e3 * gap,
         "height_discrepancy_sigma_mm": 1e3 * gap_sigma,
-        "blind_half_angle_deg": float(np.degrees(blind_half_angle(radius / distance))),
+        "blind_half_angle_deg": float(np.degrees(max(blind, 0.0))),
     }  # fmt: skip
 
 
@@ -242,6 +314,7 @@ def ball_record(fit: sphere_fit.SphereFit, radius: float, surface: Surface) -> B
     return BallFit(
         centre_camera_m=fit.centre, radius_m=radius, covariance=fit.covariance, rms_px=fit.rms_px, points=fit.points,
         radius_px=fit.radius_px, reflectance=surface.facing, edge_tint=surface.tint,
+        glass=0.0 if surface.glass is None else surface.glass.thickness,
     )  # fmt: skip
 
 

@@ -18,7 +18,8 @@ import numpy as np
 from pipeline.camera.distortion import distort, fold_radius_squared, is_pinhole
 from pipeline.camera.lens import project, rays_through
 from pipeline.light.sampling import bilinear, planes
-from pipeline.probes.reflection import incidence, solid_angle_gain
+from pipeline.probes.glass import Glass
+from pipeline.probes.reflection import first_slope, incidence, solid_angle_gain
 from pipeline.types import Camera
 
 TABLE = 1 << 16  # steps of the cosine: 1e-10 in the table's middle, 1e-5 rad at 1 degree from its end
@@ -38,7 +39,8 @@ def bands(length: int, size: int) -> Iterator[slice]:
 class Mirror:
     """A ball in a picture: its camera, ``rotation`` (3, 3) camera_from_world, ``centre`` (3,) and ``radius`` [m].
 
-    ``rim``: outermost radius that is used, as a fraction of the silhouette's (sine of the incidence).
+    ``rim``: outermost radius that is used, as a fraction of the silhouette's (sine of the incidence). ``glass`` before
+    the mirror, if any.
     """
 
     camera: Camera
@@ -46,6 +48,7 @@ class Mirror:
     centre: np.ndarray
     radius: float
     rim: float
+    glass: Glass | None = None
 
     @property
     def ratio(self) -> float:
@@ -84,10 +87,10 @@ class Mirror:
         Blind directions get the rays of the silhouette.
         """
         theta = np.arccos(np.clip(1 - 2 * np.arange(TABLE + 2) / TABLE, -1, 1))
-        angle = incidence(theta, self.ratio)
+        angle = incidence(theta, self.ratio, self.glass)
         sine = self.ratio * np.sin(np.minimum(angle, np.pi / 2))
         sine_theta = np.sin(theta)
-        limit = self.ratio / (2 - self.ratio)  # of sin rho / sin theta, towards the camera
+        limit = self.ratio / first_slope(self.ratio, self.glass)  # of sin rho / sin theta, towards the camera
         along = np.where(sine_theta > 1e-6, sine / np.maximum(sine_theta, 1e-6), np.where(theta < 1, limit, 0))
         return np.stack([along, np.sqrt(1 - sine * sine) + np.cos(theta) * along, angle], -1)
 
@@ -173,7 +176,7 @@ def pixel_solid_angles(mirror: Mirror, rows: slice) -> np.ndarray:
     cross = a[2] ** 2 * (dx * dx + dy * dy) + (dx * a[1] - dy * a[0]) ** 2
     sine2 = cross / (square * np.float32(mirror.ratio**2))
     inside = sine2 <= mirror.rim**2
-    gain = solid_angle_gain(np.where(inside, sine2, 0), mirror.ratio)
+    gain = solid_angle_gain(np.where(inside, sine2, 0), mirror.ratio, mirror.glass)
     return np.where(inside, gain * fine[..., 2] * np.float32(scale) / (square * np.sqrt(square)), 0)
 
 
@@ -188,7 +191,8 @@ def texel_directions(
 
     A fixed ray meets a ball that was displaced by d under a turned normal; the mirrored direction moves by
     ``-(2 / R) (m . d / cos i, cos i t . d)`` in the plane of reflection and across it, m and t being the unit vectors
-    normal to the ray in that plane and across it.
+    normal to the ray in that plane and across it. Glass adds half its turn's slope to ``1 / cos i`` and makes
+    ``cos i`` be ``sin(2 i + turn) / (2 sin i)``.
     """
     sine = np.full((height, width), np.nan, np.float32)
     covariance = np.zeros((height, width, 3), np.float32)
@@ -232,9 +236,14 @@ def _band_directions(
     ahead = np.cos(rho)[..., None] * spoke - np.sin(rho)[..., None] * axis
     scale = 4 / mirror.radius**2
     turned = ahead @ centre
-    radial = scale * _dot(turned, ahead) / into**2
-    mixed = scale * _dot(turned, across)
-    tangential = scale * _dot(across @ centre, across) * into**2
+    outward, aside = 1 / into, into
+    if mirror.glass is not None:
+        safe = np.clip(np.nan_to_num(sine, nan=1.0), 1e-6, 1)
+        outward = outward + 0.5 * mirror.glass.turn_slope(safe)
+        aside = np.sin(2 * np.arcsin(safe) + mirror.glass.turn(safe)) / (2 * safe)
+    radial = scale * _dot(turned, ahead) * outward**2
+    mixed = scale * _dot(turned, across) * (outward * aside)
+    tangential = scale * _dot(across @ centre, across) * aside**2
     p, q = (((down @ axis) / length[..., 0]), (east @ axis) / length[..., 0])  # of the direction of growing theta
     first, second, turned = east @ turn, down @ turn, _dot(down @ turn, east)
     found = np.stack(

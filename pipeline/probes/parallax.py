@@ -15,38 +15,58 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_from_direction
 from pipeline.light.sampling import bilinear, planes
+from pipeline.probes.glass import Glass
 from pipeline.probes.observation import ViewMap
 
 STEPS = 30  # of the reflection point: each gains a factor of about the distance over R
 SETTLED = 1e-4  # of the radius: what the last step may move the reflection point
 
 
-def mirrored_directions(points: np.ndarray, centre: np.ndarray, radius: float, camera: np.ndarray) -> np.ndarray:
+def mirrored_directions(
+    points: np.ndarray, centre: np.ndarray, radius: float, camera: np.ndarray, glass: Glass | None = None
+) -> np.ndarray:
     """Unit directions (N, 3) in which the ball's mirrored rays leave it towards finite ``points`` (N, 3), world frame.
 
     The reflection point is where the normal halves the ways to ``camera`` (3,) and to the point; NaN where the steps
-    do not settle, or the camera does not see it.
+    do not settle, or the camera does not see it. Behind ``glass`` it is that of `Glass.virtual`, whose size goes with
+    the angle.
     """
     normal = _unit(_unit(points - centre) + _unit(camera - centre))
     moved = np.full(len(points), np.inf)
     for _ in range(STEPS):
-        place = centre + radius * normal
+        place = centre + _reach(normal, centre, radius, camera, glass)[0] * normal
         better = _unit(_unit(points - place) + _unit(camera - place))
         moved = np.linalg.norm(better - normal, axis=-1)
         normal = better
         if not len(moved) or moved.max() < 0.1 * SETTLED:
             break
-    place = centre + radius * normal
+    reach, seen = _reach(normal, centre, radius, camera, glass)
+    place = centre + reach * normal
     away = _unit(points - place)
-    good = (moved < SETTLED) & (((camera - place) * normal).sum(-1) > 0) & ((away * normal).sum(-1) > 0)
+    good = (moved < SETTLED) & seen & ((away * normal).sum(-1) > 0)
     return np.where(good[:, None], away, np.nan)
+
+
+def _reach(
+    normal: np.ndarray, centre: np.ndarray, radius: float, camera: np.ndarray, glass: Glass | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far (N, 1) from the centre, along normals (N, 3), light is mirrored, and whether the camera sees it (N,)."""
+    reach = np.full((len(normal), 1), radius)
+    to_camera = camera - centre - reach * normal
+    if glass is None:
+        return reach, (to_camera * normal).sum(-1) > 0
+    angle = np.arctan2(np.linalg.norm(np.cross(to_camera, normal), axis=-1), (to_camera * normal).sum(-1))
+    size, seen = glass.virtual(angle)
+    return radius * size[:, None], seen
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def set_down(view: ViewMap, centre: np.ndarray, radius: float, camera: np.ndarray) -> ViewMap:
+def set_down(
+    view: ViewMap, centre: np.ndarray, radius: float, camera: np.ndarray, glass: Glass | None = None
+) -> ViewMap:  # fmt: skip
     """A view's map with what is below the horizon taken from the plane y = 0, seen from the ball's centre.
 
     ``centre`` and ``camera`` (3,) in the world. Directions whose reflection does not settle keep what they had: points
@@ -56,7 +76,7 @@ def set_down(view: ViewMap, centre: np.ndarray, radius: float, camera: np.ndarra
     below = slice(height // 2, height)
     w = latlong_directions(height, width)[below].reshape(-1, 3)
     points = centre - w * (centre[1] / w[:, 1])[:, None]
-    away = mirrored_directions(points, centre, radius, camera)
+    away = mirrored_directions(points, centre, radius, camera, glass)
     away = np.where(np.isfinite(away), away, w)
     u, v = latlong_from_direction(away)
     shape = (height - height // 2, width)

@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes.ball_pairs import Sight, ball_points, neighbourhood, plane_pairs
+from pipeline.probes.glass import Glass
 from pipeline.types import Camera, Raster, View
 
 LUMA = np.array([0.25, 0.5, 0.25])  # in this sum the colour mosaic's errors cancel at first order
@@ -49,8 +50,11 @@ class Aligned:
 
 
 @dataclass(frozen=True)
-class _Equations:
-    """Weighted equations of the pixels: residual (N,), by centre and blur (N, 4), by pose (N, 6), slope (N,)."""
+class Equations:
+    """Weighted equations of the pixels: residual (N,), by centre and blur (N, 4), by pose (N, 6), slope (N,).
+
+    With glass asked for, its thickness, of the radius, is a fifth column.
+    """
 
     left: np.ndarray
     by_centre: np.ndarray
@@ -61,8 +65,9 @@ class _Equations:
 
 
 def align(
-    photograph: Raster, camera: Camera, view: View, centre: np.ndarray, radius: float, blur_px: float
-) -> Aligned | None:
+    photograph: Raster, camera: Camera, view: View, centre: np.ndarray, radius: float, blur_px: float,
+    glass: Glass | None = None,
+) -> Aligned | None:  # fmt: skip
     """The centre (3,) that makes ball and plane agree, started at ``centre`` [m, camera frame], good to a few pixels.
 
     ``blur_px``: of the photograph, to start with; what is seen in the ball is much reduced before it is blurred. None
@@ -70,16 +75,17 @@ def align(
     """
     start, blurred, inset = 0.0, None, 0
     for smooth in SMOOTH_PX:
-        sight = neighbourhood(photograph, camera, view.world_from_camera, centre, radius)
-        pixel = radius / _size(sight)
+        sight = neighbourhood(photograph, camera, view.world_from_camera, centre, radius, glass)
+        pixel = radius / size_px(sight)
         if blurred is None:
             start = blurred = max((blur_px / sight.binned) ** 2 - RAYS_BLUR, 0.0)
             inset = int(min(np.ceil(INSET_BLURS * np.sqrt(start)), np.ceil(MOST_INSET * radius / pixel)))
-        equations = _equations(sight, smooth, blurred, inset, pixel)
+        equations = equations_of(sight, smooth, blurred, inset, pixel)
         if equations is None:
             return None
-        prior = 0.5 * (start - blurred), 0.5 * BLUR_SIGMA * (start + RAYS_BLUR)
-        found = _solve(equations, view.covariance, *prior)
+        wider, wider_sigma = 0.5 * (start - blurred), 0.5 * BLUR_SIGMA * (start + RAYS_BLUR)
+        held = np.diag([0, 0, 0, wider_sigma**-2])
+        found = solve(equations, view.covariance, held, np.array([0, 0, 0, wider / wider_sigma**2]))
         if found is None:
             return None
         step, covariance, left, blocks = found
@@ -89,16 +95,18 @@ def align(
     ray = centre / np.linalg.norm(centre)
     along = pixel * float(np.linalg.norm(centre)) / radius  # metres that change the outline's radius by a pixel
     common = pixel**2 * np.eye(3) + (along**2 - pixel**2) * np.outer(ray, ray)
-    covariance = pixel**2 * covariance + (COMMON_BLURS * blur_px / sight.binned) ** 2 * common
+    covariance = pixel**2 * covariance[:3, :3] + (COMMON_BLURS * blur_px / sight.binned) ** 2 * common
     return Aligned(centre, covariance, left * sight.binned, blocks)
 
 
-def _size(sight: Sight) -> float:
+def size_px(sight: Sight) -> float:
     """Radius in pixels of the sight, near enough."""
     return float(0.5 * (sight.camera.fx + sight.camera.fy) * sight.radius / sight.centre[2])
 
 
-def _equations(sight: Sight, smooth: float, blurred: float, inset: int, pixel: float) -> _Equations | None:
+def equations_of(
+    sight: Sight, smooth: float, blurred: float, inset: int, pixel: float, with_glass: bool = False
+) -> Equations | None:  # fmt: skip
     """How the ball's picture differs from its prediction, and how that goes with the centre: pixels of metre ``pixel``.
 
     Columns are in pixels: a change of the centre by ``pixel`` metres.
@@ -124,7 +132,7 @@ def _equations(sight: Sight, smooth: float, blurred: float, inset: int, pixel: f
     spread = np.stack([_smoothed(grid(part), known, np.sqrt(blurred))[at] for part in pairs.direct.T], -1)
     real, model = (_smoothed(grid(np.log(part / level) @ LUMA), known, smooth) for part in (pairs.mirrored, spread))
     slope, bend, inner = _derivatives(model, known)
-    shift = _shifts(sight, pairs.pixel + 0.5)
+    shift = _shifts(sight, pairs.pixel + 0.5, with_glass)
     inner = _shrunk(inner, inset)
     use = inner[at] & (pairs.sine < limit) & np.isfinite(shift).all((1, 2))
     if use.sum() < LEAST_PIXELS:
@@ -138,11 +146,12 @@ def _equations(sight: Sight, smooth: float, blurred: float, inset: int, pixel: f
 
     moved = -np.einsum("ni,nij->nj", slope[at], np.nan_to_num(shift))
     columns = [sharp(grid(moved[:, k])) * pixel for k in range(3)] + [sharp(bend)]
+    columns += [sharp(grid(moved[:, 9]))] if with_glass else []
     steep = np.linalg.norm(slope[at], axis=1)[use]
     noise = (pairs.mirrored_variance / pairs.mirrored**2).mean(1)[use] / 3 / max(4 * np.pi * smooth**2, 1.0)
     weight = 1 / (noise + (FLOOR_PX * steep) ** 2 + FLOOR_LOG**2)
     block = (row[use] // BLOCK_PX) * 100_000 + column[use] // BLOCK_PX
-    return _Equations(
+    return Equations(
         sharp(real - model), np.stack(columns, -1), np.stack([sharp(grid(moved[:, k])) for k in range(3, 9)], -1),
         steep, weight, np.unique(block, return_inverse=True)[1],
     )  # fmt: skip
@@ -178,8 +187,8 @@ def _derivatives(model: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.n
     return slope, bend, inner
 
 
-def _shifts(sight: Sight, px: np.ndarray) -> np.ndarray:
-    """How far (N, 2, 9) the mirror image at pixels (N, 2) moves with the centre [px/m] and the pose.
+def _shifts(sight: Sight, px: np.ndarray, with_glass: bool = False) -> np.ndarray:
+    """How far (N, 2, 9) the mirror image at pixels (N, 2) moves with the centre [px/m] and the pose; and the glass.
 
     The point of the plane is held, and what it is known by is the pixel ``P`` where it is seen directly:
     ``dx = -(dP/dx)^-1 dP/dq``, by central differences.
@@ -203,6 +212,11 @@ def _shifts(sight: Sight, px: np.ndarray) -> np.ndarray:
         step = 1e-4
         both = [direct(px, replace(sight, world_from_camera=_turned(sight, sign * step * e))) for sign in (1, -1)]
         by_q.append(change(both[0], both[1], step))
+    if with_glass:
+        step, glass = 1e-3, sight.glass or Glass(0.0)
+        thinner, thicker = (replace(glass, thickness=glass.thickness + sign * step) for sign in (-1, 1))
+        both = [direct(px, replace(sight, glass=one)) for one in (thicker, thinner)]
+        by_q.append(change(both[0], both[1], step))
     jacobian, by_q_px = np.stack(by_px, -1), np.stack(by_q, -1)
     good = np.isfinite(jacobian).all((1, 2)) & np.isfinite(by_q_px).all((1, 2))
     good &= np.abs(np.linalg.det(np.where(good[:, None, None], jacobian, 0))) > 1e-6
@@ -221,18 +235,17 @@ def _turned(sight: Sight, change: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _solve(
-    equations: _Equations, pose: np.ndarray, wider: float, wider_sigma: float
+def solve(
+    equations: Equations, pose: np.ndarray, held: np.ndarray, pull: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, int] | None:
-    """Step (4,) of centre and blur, covariance (3, 3) of the centre, what is left [px], and how many blocks.
+    """Step (K,) of centre, blur and what else is asked, its covariance (K, K), what is left [px], number of blocks.
 
-    ``pose`` (6, 6) is its covariance; ``wider`` is where the blur's step ought to be. None where the
-    centre stays open. Cauchy's weights: dirt, gloss and what stands between plane and ball is astray.
+    ``pose`` (6, 6) is its covariance; ``held`` (K, K) is what is known before of the step, as an inverse covariance,
+    and ``pull`` (K,) that times where it ought to be. None where the centre stays open. Cauchy's weights: dirt, gloss
+    and what stands between plane and ball is astray.
     """
     columns, target, own = equations.by_centre, equations.left, equations.weight
-    weight, solved, over = own, np.zeros(4), target
-    held = np.diag([0, 0, 0, wider_sigma**-2])
-    pull = np.array([0, 0, 0, wider / wider_sigma**2])
+    weight, solved, over = own, np.zeros(len(held)), target
     for _ in range(10):
         normal = columns.T @ (weight[:, None] * columns) + held
         if not np.isfinite(normal).all() or np.linalg.cond(normal) > MAX_CONDITION:
@@ -247,6 +260,9 @@ def _solve(
         return None
     inverse = np.linalg.inv(normal)
     lever = inverse @ columns.T @ (weight[:, None] * equations.by_pose)
-    covariance = inverse @ (score.T @ score) @ inverse * blocks / (blocks - 4) + lever @ pose @ lever.T
+    spread = inverse @ (score.T @ score) @ inverse * blocks / (blocks - 4)
+    known = held.copy()
+    known[3, 3] = 0  # the blur's is an opinion
+    covariance = spread + inverse @ known @ inverse + lever @ pose @ lever.T
     left = float(np.sqrt((weight * over**2).sum() / (weight * equations.slope**2).sum()))
-    return solved, covariance[:3, :3], left, blocks
+    return solved, covariance, left, blocks

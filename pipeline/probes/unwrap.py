@@ -62,7 +62,7 @@ def unwrap(
     gap = np.hypot(
         np.pi / height, 2 * np.pi / width
     )  # a texel's diagonal stays unseen: its corners must not surround it
-    widest = np.sin(np.minimum(incidence(np.array(np.pi - gap), mirror.ratio), np.pi / 2))
+    widest = np.sin(np.minimum(incidence(np.array(np.pi - gap), mirror.ratio, mirror.glass), np.pi / 2))
     mirror = replace(mirror, rim=min(mirror.rim, float(widest)))
     parts = -(-LEAST_WIDTH // width)
     edges = corners(mirror, parts * height, parts * width)
