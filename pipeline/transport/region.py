@@ -125,12 +125,10 @@ def worth_a_look(
         limits: what may be left out.
         near: from `near_objects`.
     """
-    from scipy.ndimage import binary_dilation
-
     change = _relative(glance.lost + glance.gained, glance, model, grid)
     certain = ((glance.alpha > 0) | near).reshape(*grid, 1)
     wanted = (np.abs(block_means(change)) > limits.threshold / 2).any(-1) | (block_means(certain) > 0)[..., 0]
-    return over_blocks(binary_dilation(wanted, np.ones((3, 3))), grid).ravel()
+    return over_blocks(widened(wanted, 1), grid).ravel()
 
 
 def block_means(cells: np.ndarray) -> np.ndarray:
@@ -178,16 +176,14 @@ def plan(
     Returns the region, and what of the change is left out: the largest, the noise of that figure, and the mean over the
     frame, relative to LS_noobj.
     """
-    from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
-
     lost, gained, variance = of_cells(pilot, model, grid, glanced)
-    smoothed = gaussian_filter(lost + gained, (BLUR, BLUR, 0), mode="nearest")
+    smoothed = blurred(lost + gained)
     shown = pilot.alpha.reshape(grid) > 0
     changed = (np.abs(smoothed).max(-1) > limits.threshold) | shown
-    changed = binary_dilation(changed, np.ones((5, 5)))
+    changed = widened(changed, 2)
     rough = np.maximum(bend(lost), bend(gained)) > limits.tolerance
     rough |= shown | (pilot.ground.reshape(grid) < 1)
-    traced = changed & binary_dilation(rough, np.ones((3, 3)))
+    traced = changed & widened(rough, 1)
     left = {"left_out_max": 0.0, "left_out_noise": 0.0, "left_out_mean": 0.0}
     if not changed.all():
         out = np.abs(smoothed[~changed])
@@ -198,7 +194,7 @@ def plan(
         }
     window = _around(changed, shape)
     mask = enlarge(changed, shape, window)
-    ramp = np.clip(distance_transform_edt(mask) / FEATHER, 0, 1) if not mask.all() else np.ones(mask.shape)
+    ramp = np.clip(from_border(mask) / FEATHER, 0, 1)
     weight = np.asarray(ramp * ramp * (3 - 2 * ramp), np.float32)
     everywhere = enlarge(traced, shape, window) & (weight > 0)
     return Region(window, weight, everywhere, *in_pixels((lost, gained, variance), shape, window)), left
@@ -211,16 +207,38 @@ def of_cells(
 
     Light is smoothed, the variance is that before smoothing.
     """
-    from scipy.ndimage import gaussian_filter
-
     lost, gained = (_relative(values, pilot, model, grid) for values in (pilot.lost, pilot.gained))
     variance = _relative(pilot.change_variance, pilot, model**2, grid)
     if glanced is not None and glanced.any():
         far = glanced.reshape(*grid, 1)
         lost, gained = (np.where(far, over_blocks(block_means(values), grid), values) for values in (lost, gained))
         variance = np.where(far, over_blocks(block_means(variance), grid) / (BLOCK / GLANCE) ** 2, variance)
-    lost, gained = (gaussian_filter(values, (BLUR, BLUR, 0), mode="nearest") for values in (lost, gained))
-    return lost, gained, variance
+    return blurred(lost), blurred(gained), variance
+
+
+def blurred(cells: np.ndarray) -> np.ndarray:
+    """Cells (R, C, K) smoothed by a Gaussian of `BLUR`, out to four standard deviations, constant beyond the frame."""
+    import cv2
+
+    size = 2 * round(4 * BLUR) + 1
+    return np.asarray(cv2.GaussianBlur(cells, (size, size), BLUR, borderType=cv2.BORDER_REPLICATE))
+
+
+def widened(cells: np.ndarray, by: int) -> np.ndarray:
+    """(R, C) bool: cells that are True, and those around them, ``by`` in every direction."""
+    import cv2
+
+    square = np.ones((2 * by + 1, 2 * by + 1), np.uint8)
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), square) > 0)
+
+
+def from_border(mask: np.ndarray) -> np.ndarray:
+    """(h, w) distance [px] of every pixel of a mask to the nearest that is not in it; infinite without any."""
+    import cv2
+
+    if mask.all():
+        return np.full(mask.shape, np.inf)
+    return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
 
 
 def in_pixels(cells: tuple[np.ndarray, ...], shape: tuple[int, int], window: Window) -> list[np.ndarray]:

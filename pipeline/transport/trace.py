@@ -205,7 +205,7 @@ def trace(
         block = rays[start : start + pixels]
         parts.append(strategy(worlds, block, samples, depth, seed + 7919 * (start // pixels), footprint_px))
         progress(min(1.0, (start + pixels) / len(rays)))
-    return Samples.joined(parts)
+    return parts[0] if len(parts) == 1 else Samples.joined(parts)
 
 
 def camera_rays(mi: Any, dr: Any, rays: Rays, samples: int, jitter: Any, footprint_px: float) -> Any:
@@ -341,13 +341,11 @@ def collect(
     ones = [dr.select(mask, mi.Float(1.0), mi.Float(0.0)) for mask in (on_object, on_local, ~finite)]
     planes = [mi.Float(plane) for plane in [*(channel for triple in triples for channel in triple), *ones]]
     dr.eval(planes)  # once, else each sum below would run the whole kernel again
-    means = np.stack([np.asarray(dr.block_sum(plane, count)) for plane in planes]).astype(np.float64) / count
+    sums = [np.asarray(dr.block_sum(plane, count)) for plane in planes]
     names = ("obj", "lost", "gained", "without", "albedo", "obj_albedo", "obj_normal", "obj_square", "change_square")
-    alpha, ground, not_finite = means[3 * len(names) :]
-    return Samples(
-        **{name: means[3 * i : 3 * i + 3].T for i, name in enumerate(names)},
-        count=np.full(len(alpha), float(count)),
-        alpha=alpha,
-        ground=ground,
-        not_finite=not_finite,
-    )
+    means = {name: np.empty((len(sums[0]), 3)) for name in names}
+    for number, values in enumerate(sums[: 3 * len(names)]):
+        np.divide(values, count, out=means[names[number // 3]][:, number % 3], dtype=np.float64)
+    alpha, ground, not_finite = (values.astype(np.float64) / count for values in sums[3 * len(names) :])
+    counts = np.full(len(alpha), float(count))
+    return Samples(**means, count=counts, alpha=alpha, ground=ground, not_finite=not_finite)
