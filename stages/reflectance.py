@@ -114,6 +114,7 @@ def compute(
         albedo = continued(measured, known * seen, texture.window, shape)
     share = np.zeros(shape)
     share[texture.window] = seen
+    ignored = ignoring(light[known], near.bounced[known]) if near else 0.0
     numbers = {
         "irradiance": alone,
         "albedo_median": np.median(measured[known], axis=0),
@@ -127,11 +128,12 @@ def compute(
         "detail_kept": float(kept[known].mean()),
         "texel_mm": float(1e3 * np.linalg.norm(plane.corners_m[1] - plane.corners_m[0]) / shape[1]),
         "seen_fraction": float((share > 0.5).mean()),
+        "bounce_ignored_rel": ignored,
     }
     raster = Raster({**Raster.split(np.clip(albedo, 0.0, HIGHEST)), "seen": share}, ACESCG, {"insitu:unit": "albedo"})
     terms = [
         texture_evidence(params.model, numbers["detail_kept"]),
-        bounce_evidence(near.estimate if near else None),
+        bounce_evidence(near.estimate if near else None, ignored),
         *([gradient_evidence(fitted)] if fitted else []),
         shadow_evidence(list(ratios), shadow),
         explain(surface),
@@ -194,8 +196,15 @@ def gradient_evidence(found: Fit) -> dict[str, Any]:
     }
 
 
-def bounce_evidence(found: Estimate | None) -> dict[str, Any]:
-    """Whether surfaces light each other, and which inversion was used."""
+def ignoring(light: np.ndarray, bounced: np.ndarray) -> float:
+    """Median relative error of albedo if what other surfaces throw, (N, 3) of the light (N, 3), were left out of it."""
+    return float(
+        np.median(np.linalg.norm(bounced, axis=-1) / np.linalg.norm(np.maximum(light - bounced, 1e-9), axis=-1))
+    )
+
+
+def bounce_evidence(found: Estimate | None, ignored: float) -> dict[str, Any]:
+    """Whether surfaces light each other, which inversion was used, and what leaving it out would do to the albedo."""
     term = {"term": "inter-reflection of the local scene"}
     if found is None:
         because = "one convex plane: no point of it sees another, one step of equation 8 is exact"
@@ -203,13 +212,14 @@ def bounce_evidence(found: Estimate | None) -> dict[str, Any]:
     contraction = f"spectral radius of rho F {found.spectral_radius:.2f}"
     if found.method == "gathered":
         because = f"{found.measured_share:.1%} of the bounced light is seen in the plate and gathered; {contraction}"
-        cost = "what the plate shows as bounce includes gloss"
+        left = "what the plate shows as bounce includes gloss"
     else:
         because = (
             f"only {found.measured_share:.1%} of the bounced light is measured in the plate: damped iteration, "
             f"{found.steps} steps; {contraction}"
         )
-        cost = f"prediction and plate still differ by {found.residual:.1%} at the worst patch; hidden faces are guessed"
+        left = f"prediction and plate still differ by {found.residual:.1%} at the worst patch; hidden faces are guessed"
+    cost = f"albedo {ignored:.1%} too bright (median) if it were left out; {left}"
     return {**term, "modelled": True, "because": because, "could_cost": cost}
 
 
