@@ -8,6 +8,7 @@ filled smoothly and marked by ``seen`` = 0.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from pipeline.light import near_field, smooth
 from pipeline.light.alike import ALIKE
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
-from pipeline.probes import clipped, combine, filling, levelling
+from pipeline.probes import clipped, combine, filling, ground_gloss, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
 from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS, WISHES
@@ -44,22 +45,19 @@ def compute(
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
     merged, alike = combine.merge(list(maps.values())), combine.alike_deg(list(maps.values()))
-    rgb, seen = merged.rgb, merged.seen
     shared = np.hypot(observed.scale_sigma, shared_sigma(balance, next(iter(maps))))  # by all: merging keeps it
-    variance = merged.variance + (shared * rgb) ** 2
-    known = np.minimum(seen * 4, 1)
-    rgb, variance, laid = combine.lay_plate(
-        rgb, variance, known, lookup_channels(photographs["plate"])[..., :7], camera,
-        views["plate"].world_from_camera, observed.centre_world,
-    )  # fmt: skip
-    known, seen = np.maximum(known, laid), np.maximum(seen, laid)
-    gap = filling.prior(rgb, known)
-    rgb = filling.fill(rgb, known)
-    variance = filling.filled_variance(rgb, variance, known, gap)
-    over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - laid)
-    seen_lamps = clipped.witness(shots, observed) if over.any() else clipped.Witness()
-    lamps = clipped.recover(rgb, variance, over, seen_lamps)
-    rgb, variance = lamps.rgb, lamps.variance
+    plate, eye = lookup_channels(photographs["plate"])[..., :7], views["plate"].world_from_camera
+    below = combine.plate_below(plate, camera, eye, observed.centre_world, merged.seen.shape)
+    over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - below.share)
+    witness = clipped.witness(shots, observed) if over.any() else clipped.Witness()
+    whole = completed(merged, shared, below, over, witness)
+    gloss = ground_gloss.assess(
+        whole.lamps.rgb, merged.rgb, merged.seen, below, plate, camera, eye, observed.centre_world
+    )
+    if gloss.taken:
+        whole = completed(merged, shared, gloss.below, over, witness, gloss)
+    lamps, known, gap, laid = whole.lamps, whole.known, whole.gap, below.share
+    rgb, variance, seen = lamps.rgb, lamps.variance, np.maximum(merged.seen, laid)
     if observed.smooth_only:
         rgb, variance = smooth.reduced(rgb, variance)
     centre, room = observed.centre_world, near_field.room_of(facts)
@@ -76,7 +74,7 @@ def compute(
     numbers |= near.numbers
     numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
     differing, filled = combine.disagreement_numbers(merged), filling.report(rgb, known, gap)
-    numbers |= differing | filled
+    numbers |= differing | filled | ground_gloss.numbers(gloss)
     numbers |= lamps.numbers | map_numbers(rgb, seen)
     environment = Raster(
         {
@@ -98,7 +96,38 @@ def compute(
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
     evidence = [*observed.evidence, *lamps.evidence, *reasons(applied)]
     evidence += [combine.disagreement_reason(differing, len(maps)), filling.reason(filled, gap), near.evidence]
+    evidence.append(ground_gloss.reason(gloss))
     return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The map with the plate laid under it, gaps filled, and lamps recovered; ``known`` (H, W), and the gaps' prior."""
+
+    lamps: clipped.Recovered
+    known: np.ndarray
+    gap: filling.Prior | None
+
+
+def completed(
+    merged: combine.Merged, shared: np.ndarray, below: combine.Below, over: np.ndarray, witness: clipped.Witness,
+    gloss: ground_gloss.Gloss | None = None,
+) -> Whole:  # fmt: skip
+    """From what the probe saw to a map of all directions; with ``gloss``, what is filled shows its mirror images."""
+    known = np.minimum(merged.seen * 4, 1)
+    rgb, variance = combine.lay_under(merged.rgb, merged.variance + (shared * merged.rgb) ** 2, known, below)
+    known = np.maximum(known, below.share)
+    offset = np.zeros(rgb.shape) if gloss is None else gloss.offset
+    matt = rgb - offset * (known > 0)[..., None]
+    gap = filling.prior(matt, known)
+    filled = filling.fill(matt, known)
+    variance = filling.filled_variance(filled, variance, known, gap)
+    if gloss is None:
+        rgb = filled
+    else:
+        rgb = known[..., None] * rgb + (1 - known[..., None]) * (np.maximum(filled, 0) + offset)
+        variance = variance + ground_gloss.mirrored_variance(gloss, known)
+    return Whole(clipped.recover(rgb, variance, over, witness), known, gap)
 
 
 def level_views(maps: dict[str, ViewMap], warnings: list[str]) -> tuple[dict[str, dict[str, float]], list[str]]:

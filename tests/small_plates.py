@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,27 @@ def photograph(
     depth: int = 3,
 ) -> Raster:
     """The plate: mean of REPEATS path-traced renders and NOISE, with the variance of both."""
+    rng = np.random.default_rng(seed)
+    traced = tracer(albedo, environment, gloss, proxies, depth)
+    row, column = np.divmod(np.arange(CAMERA.width * CAMERA.height), CAMERA.width)
+    renders = []
+    for repeat in range(REPEATS):
+        px = np.repeat(np.stack([column, row], -1), samples, 0) + rng.uniform(size=(len(row) * samples, 2))
+        way = pixel_rays(CAMERA, px) @ VIEW.world_from_camera[:3, :3].T
+        radiance = traced(np.broadcast_to(EYE, way.shape), way, 1000 * seed + repeat)
+        renders.append(radiance.reshape(CAMERA.height, CAMERA.width, samples, 3).mean(2))
+    mean = np.mean(renders, 0)
+    variance = np.var(renders, 0, ddof=1) / REPEATS + (NOISE * mean) ** 2
+    noisy = mean + NOISE * mean * rng.normal(size=mean.shape)
+    mask = np.zeros(mean.shape[:2], np.uint32)
+    return Raster({**Raster.split(noisy), **Raster.split(variance, "variance"), "mask": mask}, "acescg")
+
+
+def tracer(
+    albedo: np.ndarray, environment: np.ndarray, gloss: dict[str, float] | None = None,
+    proxies: tuple[tuple[Proxy, tuple[float, float, float]], ...] = (), depth: int = 3,
+) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:  # fmt: skip
+    """A function of starts and unit ways (N, 3) and a seed: one path's radiance (N, 3) each."""
     mi = use_mitsuba()
     bsdf: dict[str, Any] = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": ground_texture(mi, albedo)}}
     if gloss is not None:
@@ -69,21 +91,12 @@ def photograph(
     distant, plane = environment_emitter(mi, environment), ground_shape(ground(), bsdf)
     scene = mi.load_dict({"type": "scene", "distant": distant, "ground": plane, **shapes})
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-    rng = np.random.default_rng(seed)
-    row, column = np.divmod(np.arange(CAMERA.width * CAMERA.height), CAMERA.width)
-    renders = []
-    for repeat in range(REPEATS):
-        px = np.repeat(np.stack([column, row], -1), samples, 0) + rng.uniform(size=(len(row) * samples, 2))
-        way = pixel_rays(CAMERA, px) @ VIEW.world_from_camera[:3, :3].T
-        start = np.broadcast_to(EYE, way.shape)
+
+    def traced(start: np.ndarray, way: np.ndarray, seed: int) -> np.ndarray:
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(1000 * seed + repeat, len(way))
+        sampler.seed(seed, len(way))
         vectors = [np.ascontiguousarray(part.T, np.float32) for part in (start, way)]
         ray = mi.RayDifferential3f(mi.Point3f(vectors[0]), mi.Vector3f(vectors[1]))
-        radiance = np.array(integrator.sample(scene, sampler, ray)[0]).T
-        renders.append(radiance.reshape(CAMERA.height, CAMERA.width, samples, 3).mean(2))
-    mean = np.mean(renders, 0)
-    variance = np.var(renders, 0, ddof=1) / REPEATS + (NOISE * mean) ** 2
-    noisy = mean + NOISE * mean * rng.normal(size=mean.shape)
-    mask = np.zeros(mean.shape[:2], np.uint32)
-    return Raster({**Raster.split(noisy), **Raster.split(variance, "variance"), "mask": mask}, "acescg")
+        return np.array(integrator.sample(scene, sampler, ray)[0]).T
+
+    return traced

@@ -300,7 +300,9 @@ def test_laid_plate_lies_within_its_intervals():
     w = latlong_directions(256, 512).reshape(-1, 3)
     truth = resize_environment(place.radiance(np.broadcast_to(centre, w.shape), w).reshape(256, 512, 3), HEIGHT, WIDTH)
     nothing = np.zeros((HEIGHT, WIDTH, 3))
-    rgb, variance, share = combine.lay_plate(nothing, nothing, nothing[..., 0], plate, camera, pose, centre)
+    below = combine.plate_below(plate, camera, pose, centre, (HEIGHT, WIDTH))
+    rgb, variance = combine.lay_under(nothing, nothing, nothing[..., 0], below)
+    share = below.share
     whole = share > 0.999
     z = np.abs(rgb - truth)[whole] / np.sqrt(variance[whole])
     assert whole.sum() > 500

@@ -64,9 +64,8 @@ def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -
     Recovered texels share one error, and their variance holds the map's own scale; zero for a map without variance.
     """
     height, width = environment.shape
-    inside = np.zeros(height * width, bool)
-    inside[np.asarray(texels, int)] = True
-    inside = inside.reshape(height, width)
+    inside = np.zeros((height, width), bool)
+    inside.ravel()[np.asarray(texels, int)] = True
     weight = latlong_solid_angles(height, width) * np.maximum(latlong_directions(height, width) @ direction, 0)
     weight = (weight * inside)[..., None]
     shared, told = shared_sigma_of(environment), environment.channels.get("recovered", np.zeros((height, width))) > 0

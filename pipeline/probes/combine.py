@@ -183,22 +183,29 @@ def disagreement_reason(figures: dict[str, float], views: int) -> dict[str, Any]
     }
 
 
-def lay_plate(
-    rgb: np.ndarray, variance: np.ndarray, known: np.ndarray, plate: np.ndarray, camera: Camera,
-    world_from_camera: np.ndarray, centre: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Directions that meet the plane y = 0 near the ball show the plate's pixel there, not the ball's reflection.
+@dataclass(frozen=True)
+class Below:
+    """The plate's picture of the plane near the probe, on the map: radiance and variance (H, W, 3), share (H, W)."""
+
+    rgb: np.ndarray
+    variance: np.ndarray
+    share: np.ndarray
+
+
+def plate_below(
+    plate: np.ndarray, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, shape: tuple[int, int]
+) -> Below:
+    """What the plate shows in the directions of a map of ``shape`` that meet the plane y = 0 near the probe.
 
     The ball mirrors its own shadow and contact, and displaces what is a few radii away; the plate shows the same
-    plane, taken as diffuse, without it. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees down, fully from
-    11: within 8 radii of the foot. ``known`` (H, W) in [0, 1] says how far the map is measured. Returns radiance,
-    variance, and the share (H, W) of the plate. A texel is the mean of 2 x 2 lookups; half a pixel of misplacement of
-    what the plate shows is in its variance.
+    plane without it. ``plate`` (h, w, 7): RGB, variance RGB, valid. From 7 degrees down, fully from 11: within 8 radii
+    of the foot. A texel is the mean of 2 x 2 lookups; half a pixel of misplacement of what the plate shows is in its
+    variance.
     """
-    height, width = known.shape
+    height, width = shape
     first = int(height * (0.5 + np.radians(7.0) / np.pi))
     groups = planes(_displaced(plate))
-    sums = np.zeros((height - first, width, 7))
+    sums = np.zeros((height, width, 7))
     for row, column in np.ndindex(PLATE_SPLIT, PLATE_SPLIT):
         v = (np.arange(first, height) + (row + 0.5) / PLATE_SPLIT) / height
         u = (np.arange(width) + (column + 0.5) / PLATE_SPLIT) / width
@@ -209,17 +216,21 @@ def lay_plate(
         inside = ((px > 1) & (px < (camera.width - 1, camera.height - 1))).all(-1)
         found = bilinear(groups, np.where(inside, px[..., 0], 0), np.where(inside, px[..., 1], 0))
         weight = ramp(-np.arcsin(w[..., 1]) - np.radians(11.0), np.radians(4.0)) * inside * (found[..., 6] > 0.999)
-        sums += weight[..., None] * np.concatenate([found[..., :6], np.ones_like(found[..., :1])], -1)
-    laid = np.zeros((height, width, 7))
-    laid[first:] = sums / np.where(sums[..., 6:] > 0, sums[..., 6:], 1)
-    share = np.zeros((height, width))
-    share[first:] = sums[..., 6] / PLATE_SPLIT**2
-    rest = (1 - share) * known
-    total = np.where(share + rest > 0, share + rest, 1)
-    parts = [(weight / total)[..., None] for weight in (share, rest)]
-    mixed = parts[0] * laid[..., :3] + parts[1] * rgb
-    spread = parts[0] ** 2 * laid[..., 3:6] + parts[1] ** 2 * np.where(parts[1] > 0, variance, 0)
-    return mixed, spread, share
+        sums[first:] += weight[..., None] * np.concatenate([found[..., :6], np.ones_like(found[..., :1])], -1)
+    laid = sums[..., :6] / np.where(sums[..., 6:] > 0, sums[..., 6:], 1)
+    return Below(laid[..., :3], laid[..., 3:], sums[..., 6] / PLATE_SPLIT**2)
+
+
+def lay_under(rgb: np.ndarray, variance: np.ndarray, known: np.ndarray, below: Below) -> tuple[np.ndarray, np.ndarray]:
+    """A map (H, W, 3) and its variance with the plate laid over what the probe saw of the plane near it.
+
+    ``known`` (H, W) in [0, 1] says how far the map is measured.
+    """
+    rest = (1 - below.share) * known
+    total = np.where(below.share + rest > 0, below.share + rest, 1)
+    parts = [(weight / total)[..., None] for weight in (below.share, rest)]
+    mixed = parts[0] * below.rgb + parts[1] * rgb
+    return mixed, parts[0] ** 2 * below.variance + parts[1] ** 2 * np.where(parts[1] > 0, variance, 0)
 
 
 def _displaced(plate: np.ndarray) -> np.ndarray:
