@@ -105,7 +105,8 @@ def compute(
     sigma = np.pi * updated_brdf(np.sqrt(kept * texture.variance), light)
     variance = environment.rgb("variance") if "variance.R" in environment.channels else None
     unsure = unsure_share(environment.rgb(), variance, plane.normal, alone)
-    scale = disagreement(measured[known], sigma[known], unsure)
+    matt = np.pi * updated_brdf(values, light)[known] if surface.model != "diffuse" else None
+    scale = disagreement(measured[known], sigma[known], unsure, matt)
     if said := warning(scale, np.quantile(measured[known], 0.01, axis=0)):
         warnings.append(said)
     if params.model == "uniform":

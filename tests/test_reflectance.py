@@ -215,6 +215,18 @@ def test_a_clipped_lamp_is_named():
     assert scale.unsure_share(LAMP, None, NORMAL, light) == 0
 
 
+def test_gloss_taken_off_something_matt_is_named_and_black_level_is_not():
+    """A tenth of the texels is a black board on a glossy ground: the lobe of 0.2 leaves it below zero."""
+    albedo, sigma = np.full((100, 3), 0.4), np.full((100, 3), 1e-3)
+    albedo[:10] = 0.03 - 0.2
+    found = scale.disagreement(albedo, sigma, 0.0, albedo + 0.2)
+    assert "something matt lies on the glossy ground" in found.cause
+    assert found.below == pytest.approx(0.1)
+    raw = np.where(albedo < 0, -0.05, albedo + 0.2)  # dark in the plate itself, whatever is taken off
+    assert "black level" in scale.disagreement(albedo, sigma, 0.0, raw).cause
+    assert "black level" in scale.disagreement(albedo, sigma, 0.0).cause
+
+
 def test_uniform_model_is_the_median():
     light = irradiance(SKY, NORMAL[None])[0]
     albedo = solve(plate(smooth(where_seen()), light), model="uniform").outputs["albedo"].rgb()

@@ -19,6 +19,7 @@ QUANTILE = 0.99
 UNKNOWN = 0.5  # relative uncertainty of a texel from which on its light is not known
 UNSURE = 0.02  # share of the irradiance from texels whose light is only a lower bound
 PATCHY = 0.1  # share of the texels above 1 up to which it is a highlight, not the scale
+MOSTLY = 0.5  # of the texels below 0: what explains so many is named
 DARK = 0.02  # 99 % quantile below which nothing real is as dark in all channels
 
 
@@ -50,10 +51,16 @@ def unsure_share(environment: np.ndarray, variance: np.ndarray | None, normal: n
     return float((power * np.maximum(direction @ normal, 0)).sum() / light.sum())
 
 
-def disagreement(albedo: np.ndarray, sigma: np.ndarray, unsure: float) -> Disagreement:
-    """What albedo (N, 3) with noise ``sigma`` (N, 3) says about the scale; ``unsure`` is that of `unsure_share`."""
+def disagreement(
+    albedo: np.ndarray, sigma: np.ndarray, unsure: float, matt: np.ndarray | None = None
+) -> Disagreement:  # fmt: skip
+    """What albedo (N, 3) with noise ``sigma`` (N, 3) says about the scale; ``unsure`` is that of `unsure_share`.
+
+    ``matt`` (N, 3): what it would be had no gloss been taken off the plate's radiance; None where none was.
+    """
     above = float((albedo > 1 + SIGMAS * sigma).any(-1).mean())
-    below = float((albedo < -SIGMAS * sigma).any(-1).mean())
+    negative = (albedo < -SIGMAS * sigma).any(-1)
+    below = float(negative.mean())
     high = np.quantile(albedo, QUANTILE, axis=0).max()
     if above > TOLERATED:
         if unsure > UNSURE:
@@ -67,6 +74,12 @@ def disagreement(albedo: np.ndarray, sigma: np.ndarray, unsure: float) -> Disagr
                 "the whole plane exceeds it: exposure between plate and ball, or the ball's reflectance set too high"
             )
         return Disagreement(above, below, float(high), cause)
+    if below > TOLERATED and matt is not None and (matt[negative] > 0).all(-1).mean() > MOSTLY:
+        cause = (
+            "the ground's mirror image was taken off where none is: something matt lies on the glossy ground, as a "
+            "board does, or the lobe is not quite the ground's"
+        )
+        return Disagreement(above, below, 1.0, cause)
     if below > TOLERATED:
         return Disagreement(above, below, 1.0, "black level of the plate, or veiling glare taken off twice")
     if 0 < high < DARK:
