@@ -26,7 +26,7 @@ from pipeline.conventions import WORLD_FROM_MARKER, invert_rigid, transform_poin
 from pipeline.image.colour import encode_srgb
 from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.run.formats import write_png
-from pipeline.types import Camera, Reconstruction
+from pipeline.types import Camera, Reconstruction, Sources
 from stages import calibrate, knobs
 from tests.printed_board import BOARD, MARKER, charuco_print, looking_at, marker_print, straightened
 
@@ -112,7 +112,7 @@ def calibrated_lens(rng: np.random.Generator) -> Camera:
             write_png(Path(folder) / file, (encode_srgb(linear) * 255 + 0.5).astype(np.uint8))
         facts = {"capture_root": folder, "board": BOARD, "camera": {"calibration": ["*.png"], "given": None}}
         photos = [{"file": file} for file in files]
-        result = calibrate.compute(facts, {}, photos, Reconstruction(), knobs.Calibrate())
+        result = calibrate.compute(facts, {}, photos, Reconstruction(), Sources(), knobs.Calibrate())
     return result.outputs["camera"]  # type: ignore[no-any-return]
 
 

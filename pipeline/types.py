@@ -166,6 +166,7 @@ class Sources(Record):
 
     cloud: bool = False  # whether they are to be oriented at all
     views: list[str] = []  # whose pose is to come from them: no cheaper source is good enough, or it was asked for
+    lens: Camera | None = None  # EXIF's, made surer by boards in the capture's own views; None: nothing to add
 
 
 class Reconstruction(Record):

@@ -6,7 +6,8 @@ photographs that it was not fitted to (`pipeline/camera/lens_ladder.py`). Covari
 chosen model times chi2 per degree of freedom. A ball that states a camera of its own gets it in the same way. Without
 board photographs the lens comes from the tracks of the further views where they were oriented (stage sfm); from a
 former calibration; or, for want of all these, from the focal length in EXIF and lensfun, with the uncertainty of such
-words. A set of photographs that leaves rays of the frame uncertain is flagged, and the one to take next is named.
+words, which boards in the capture's own views make less (stage sources). A set of photographs that leaves rays of the
+frame uncertain is flagged, and the one to take next is named.
 Limits: one focus and zoom for all photographs of a camera; a flat board; a fisheye to 88 degrees from its axis; whether
 residuals still have a pattern over the frame is tested; terms left out have no variance, so the evidence says what they
 could cost.
@@ -28,11 +29,11 @@ from pipeline.camera.given_camera import given_camera
 from pipeline.camera.lens_ladder import SURE, Photos, best_lens
 from pipeline.camera.residual_pattern import pattern
 from pipeline.camera.sfm import self_calibrated
-from pipeline.camera.view_set import ViewSet, doubts_of, lens_sigma, next_photograph, summed
-from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, CAMERA, FACTS, RECONSTRUCTION, VIEW_CAMERAS
+from pipeline.camera.view_set import WARNED_FOCAL, ViewSet, doubts_of, lens_sigma, next_photograph, summed
+from pipeline.run.artifacts import BOARD_PHOTOS, BRACKETS, CAMERA, FACTS, RECONSTRUCTION, SOURCES, VIEW_CAMERAS
 from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.run.stage import Stage
-from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result
+from pipeline.types import Bracket, Camera, Frame, Reconstruction, Result, Sources
 from stages import knobs
 
 REFUSED_FOCAL = 0.05  # standard uncertainty, relative
@@ -42,7 +43,7 @@ PATTERN_PX = 0.1  # size from which residuals are said to have a pattern
 
 def compute(
     facts: dict[str, Any], brackets: dict[str, Bracket], board_photos: list[dict[str, str]],
-    reconstruction: Reconstruction, params: knobs.Calibrate,
+    reconstruction: Reconstruction, sources: Sources, params: knobs.Calibrate,
 ) -> Result:  # fmt: skip
     """The plate's camera (pixels with the first centre at (0.5, 0.5)), and those of balls that state their own.
 
@@ -56,6 +57,11 @@ def compute(
     else:
         lens_name = (facts.get("lens") or {}).get("name") or ""
         camera, numbers, warnings, evidence = exif_camera(_known(frame), lens_name)
+        if sources.lens is not None:
+            camera = sources.lens
+            relative = float(np.sqrt(camera.covariance[0, 0]) / camera.fx)
+            numbers |= {"source": camera.source, "focal_sigma_rel": relative, "rms_px": camera.rms_px}
+            warnings = few_boards(relative)
         whole = Result({"camera": camera}, numbers, warnings, evidence)
     cameras: dict[str, Camera] = {}
     done: list[tuple[dict[str, Any], Camera]] = []
@@ -74,6 +80,16 @@ def compute(
             whole.evidence.extend({**row, "term": f"{row['term']} ({ball['name']})"} for row in found.evidence)
         cameras[ball["name"]] = same
     return Result({**whole.outputs, "view_cameras": cameras}, whole.numbers, whole.warnings, whole.evidence)
+
+
+def few_boards(relative: float) -> list[str]:
+    """What to say of a focal length that EXIF and the boards in view tell to a share ``relative`` (one sigma)."""
+    if relative <= WARNED_FOCAL:
+        return []
+    return [
+        f"calibrate: focal length by EXIF and the board in the capture's own views, known to {relative:.1%} only, and "
+        "what is placed scales with it; photograph a board for [camera] calibration"
+    ]
 
 
 def frame_of(brackets: dict[str, Bracket], view: str) -> Frame | None:
@@ -211,6 +227,12 @@ STAGE = Stage(
     "calibrate",
     compute,
     knobs.Calibrate,
-    inputs={"facts": FACTS, "brackets": BRACKETS, "board_photos": BOARD_PHOTOS, "reconstruction": RECONSTRUCTION},
+    inputs={
+        "facts": FACTS,
+        "brackets": BRACKETS,
+        "board_photos": BOARD_PHOTOS,
+        "reconstruction": RECONSTRUCTION,
+        "sources": SOURCES,
+    },
     outputs={"camera": CAMERA, "view_cameras": VIEW_CAMERAS},
 )

@@ -18,7 +18,7 @@ from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import Sightings
 from pipeline.camera.rigid import camera_points
 from pipeline.run.errors import CaptureError, ManifestError, NumericalError
-from pipeline.types import Camera, Reconstruction
+from pipeline.types import Camera, Reconstruction, Sources
 from stages import calibrate, knobs
 
 TRUTH = Camera(
@@ -61,7 +61,7 @@ def run(monkeypatch: pytest.MonkeyPatch, corners: list[np.ndarray], sizes: list[
     )  # fmt: skip
     facts = {"capture_root": ".", "board": BOARD, "camera": {"calibration": ["*.jpg"], "given": None}}
     return calibrate.compute(
-        facts, {}, [{"file": f"{i}.jpg"} for i in range(len(corners))], Reconstruction(), knobs.Calibrate()
+        facts, {}, [{"file": f"{i}.jpg"} for i in range(len(corners))], Reconstruction(), Sources(), knobs.Calibrate()
     )
 
 
@@ -157,7 +157,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_given_camera() -> None:
     given = {"width": 640, "height": 480, "fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "distortion": [0.1]}
-    result = calibrate.compute({"camera": {"given": given}}, {}, [], Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute({"camera": {"given": given}}, {}, [], Reconstruction(), Sources(), knobs.Calibrate())
     camera = result.outputs["camera"]
     assert camera.source == "given"
     np.testing.assert_array_equal(camera.distortion, [0.1, 0, 0, 0, 0])
@@ -165,7 +165,7 @@ def test_given_camera() -> None:
     bad = {**given, "focal": 1.0}
     del bad["fx"]
     with pytest.raises(ManifestError) as error:
-        calibrate.compute({"camera": {"given": bad}}, {}, [], Reconstruction(), knobs.Calibrate())
+        calibrate.compute({"camera": {"given": bad}}, {}, [], Reconstruction(), Sources(), knobs.Calibrate())
     assert len(error.value.problems) == 2
 
 
@@ -189,7 +189,7 @@ def photographs_of(folder: Path) -> tuple[dict, dict, list[dict[str, str]]]:
     ],
 )  # fmt: skip
 def test_captures_with_known_lens(folder: Path, truth: Camera) -> None:
-    result = calibrate.compute(*photographs_of(folder), Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(*photographs_of(folder), Reconstruction(), Sources(), knobs.Calibrate())
     camera = result.outputs["camera"]
     assert result.numbers["rms_px"] < 0.2  # the brief's figure
     assert abs(camera.fx / truth.fx - 1) < 1e-3  # measured 1e-4 and 4e-4
@@ -293,7 +293,7 @@ def test_bad_board_frames_are_named(tmp_path: Path) -> None:
     save(tmp_path / "other.png", photograph(other, lens, pose, 3))
     facts = {"capture_root": str(tmp_path), "board": BOARD, "camera": {"calibration": ["*"], "given": None}}
     files = [{"file": path.name} for path in sorted(tmp_path.glob("*.png"))]
-    result = calibrate.compute(facts, {}, files, Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(facts, {}, files, Reconstruction(), Sources(), knobs.Calibrate())
     left_out = [text.split(":")[0] for text in result.warnings if "left out" in text]
     assert left_out == ["blurred.png", "other.png"]
     assert "half.png" in result.numbers["photo_rms_px"]

@@ -24,7 +24,7 @@ from pipeline.image.frames import read_frame
 from pipeline.image.lens_database import distortion_samples
 from pipeline.run.errors import CaptureError
 from pipeline.run.manifest import BallFacts, CameraFacts
-from pipeline.types import Bracket, Camera, Frame, Reconstruction
+from pipeline.types import Bracket, Camera, Frame, Reconstruction, Sources
 from stages import calibrate, knobs
 from tests.dng_writer import write_dng
 
@@ -128,7 +128,7 @@ def test_the_pose_carries_what_exif_does_not_know() -> None:
 def test_stage_without_anything_but_exif() -> None:
     bracket = Bracket(name="plate", role="plate", frames=[frame_of(camera=CANON, focal_mm=50.0)])
     facts = {"camera": {"calibration": [], "given": None}, "views": None, "lens": {"name": ZOOM}}
-    result = calibrate.compute(facts, {"plate": bracket}, [], Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(facts, {"plate": bracket}, [], Reconstruction(), Sources(), knobs.Calibrate())
     assert result.outputs["camera"].source == "exif"
     assert result.outputs["camera"].lens == ZOOM
     assert len(result.warnings) == 1
@@ -150,7 +150,7 @@ def test_a_former_calibration_is_taken_up(tmp_path: Path) -> None:
     facts = {"camera": {"file": "camera.json", "given": None, "calibration": []}, "ball": [], "views": None}
     assert former_camera.add_former_cameras(facts, tmp_path / "capture.toml", [tmp_path]) == []
     bracket = Bracket(name="plate", role="plate", frames=[frame_of(camera=CANON, lens=ZOOM, focal_mm=50.0)])
-    result = calibrate.compute(facts, {"plate": bracket}, [], Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(facts, {"plate": bracket}, [], Reconstruction(), Sources(), knobs.Calibrate())
     camera = result.outputs["camera"]
     np.testing.assert_array_equal(camera.covariance, former().covariance)
     assert (camera.fx, camera.source, result.warnings) == (8300, "reused", [])

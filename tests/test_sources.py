@@ -13,7 +13,7 @@ from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points
 from pipeline.camera.sources import KnownLens, left_at
 from pipeline.run.errors import ManifestError
-from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, View
+from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Sources, View
 from stages import calibrate, knobs, pose, sfm, sources
 
 TRUTH = Camera(width=480, height=360, fx=640, fy=640, cx=240, cy=180)
@@ -151,7 +151,7 @@ def test_a_stated_pose_undoes_nothing_of_the_lens() -> None:
 def test_without_a_cloud_the_lens_is_what_exif_says() -> None:
     facts = {**FACTS, "camera": {"given": None}}
     brackets = {"plate": Bracket(name="plate", role="plate", frames=[frame("p.dng", **EXIF)])}
-    camera = calibrate.compute(facts, brackets, [], Reconstruction(), knobs.Calibrate()).outputs["camera"]
+    camera = calibrate.compute(facts, brackets, [], Reconstruction(), Sources(), knobs.Calibrate()).outputs["camera"]
     assert camera.source == "exif"
 
 

@@ -17,7 +17,7 @@ from pipeline.conventions import invert_rigid, latlong_directions, transform_poi
 from pipeline.image import colour
 from pipeline.light.environment import AXES, irradiance
 from pipeline.run.errors import CaptureError, ManifestError
-from pipeline.types import Balance, Camera, Raster, Reconstruction, View
+from pipeline.types import Balance, Camera, Raster, Reconstruction, Sources, View
 from stages import balance, calibrate, develop, ingest, knobs, merge, pose, probe
 
 OTHER_MATRIX = np.array([[0.95, -0.33, -0.10], [-0.38, 1.15, 0.26], [-0.05, 0.16, 0.55]])
@@ -146,12 +146,16 @@ def test_cameras_of_views_are_kept_apart():
     given = {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0, "cx": 320.0, "cy": 240.0}
     other = {"given": {**given, "fx": 900.0, "fy": 900.0}, "calibration": []}
     balls = [{"name": "a", "camera": None}, {"name": "b", "camera": other}, {"name": "c", "camera": other}]
-    result = calibrate.compute({"camera": {"given": given}, "ball": balls}, {}, [], Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(
+        {"camera": {"given": given}, "ball": balls}, {}, [], Reconstruction(), Sources(), knobs.Calibrate()
+    )
     assert result.outputs["camera"].fx == 600
     assert {name: camera.fx for name, camera in result.outputs["view_cameras"].items()} == {"b": 900, "c": 900}
     balls[1] = {"name": "b", "camera": {"given": {"fx": 1}, "calibration": []}}
     with pytest.raises(ManifestError) as error:
-        calibrate.compute({"camera": {"given": given}, "ball": balls}, {}, [], Reconstruction(), knobs.Calibrate())
+        calibrate.compute(
+            {"camera": {"given": given}, "ball": balls}, {}, [], Reconstruction(), Sources(), knobs.Calibrate()
+        )
     assert "ball[1].camera.given.fy: missing; it is required" in str(error.value)
 
 
@@ -163,7 +167,7 @@ def test_a_balls_own_board_photographs_calibrate_its_camera():
         "ball": [{"name": "b", "camera": {"calibration": ["x"], "given": None}}],
     }  # fmt: skip
     photos = [{"file": str(file.relative_to(DESK)), "view": "b"} for file in files]
-    result = calibrate.compute(facts, {}, photos, Reconstruction(), knobs.Calibrate())
+    result = calibrate.compute(facts, {}, photos, Reconstruction(), Sources(), knobs.Calibrate())
     assert result.outputs["camera"].fx == 600
     assert result.outputs["view_cameras"]["b"].fx == pytest.approx(1150, rel=1e-3)  # the desk's true lens
     assert result.numbers["b"]["rms_px"] < 0.2

@@ -6,7 +6,7 @@ beyond it are the further views oriented (stage sfm), which costs ten times as m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,9 @@ from pipeline.camera.estimates import (
 from pipeline.camera.exif_camera import exif_camera
 from pipeline.camera.given_camera import given_camera
 from pipeline.camera.lens_ladder import fit_model
-from pipeline.camera.marker_map import with_tripod
+from pipeline.camera.marker_map import solve, with_tripod
 from pipeline.camera.opencv_bridge import Sightings, first_calibration
+from pipeline.camera.own_boards import bundle_of_boards, sharpened
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen, camera_start
 from pipeline.camera.sights import FEWEST_CORNERS, marks_in, sighted_board
@@ -46,6 +47,12 @@ class KnownLens:
     camera: Camera
     source: str
     bettered: bool
+
+
+def only_words(facts: dict[str, Any], board_photos: list[dict[str, str]]) -> bool:
+    """Whether nothing but metadata tells of the plate's lens, further views apart."""
+    stated, mine = facts["camera"], [photo for photo in board_photos if photo.get("view", "plate") == "plate"]
+    return not (stated.get("given") or stated.get("former") or mine)
 
 
 def known_lens(facts: dict[str, Any], frame: Frame, board_photos: list[dict[str, str]]) -> KnownLens:
@@ -70,21 +77,83 @@ def known_lens(facts: dict[str, Any], frame: Frame, board_photos: list[dict[str,
     return KnownLens(camera, "as EXIF says", True)
 
 
+def marks_of(
+    facts: dict[str, Any], names: Iterable[str], look: Look, lens: Camera
+) -> tuple[dict[str, list[Seen]], dict[str, str]]:
+    """Board or markers in each view, none where too little is seen, and then in words why."""
+    marks: dict[str, list[Seen]] = {}
+    notes: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        marks[name] = []
+        try:
+            if facts.get("board"):
+                seen = sighted_board(look(name), facts["board"], lens)
+                count, needed = len(seen.px), FEWEST_CORNERS
+                marks[name] = [Seen(0, seen.world_m, seen.px)] if count >= needed else []
+            else:
+                marks[name], said = marks_in(facts, look(name), lens)
+                count, needed = sum(len(one.px) for one in marks[name]), 4
+                if said and not marks[name]:
+                    raise CaptureError(said[0])
+        except CaptureError as error:
+            notes[name] = str(error)
+            continue
+        if not marks[name]:
+            notes[name] = (
+                f"it shows {count} corners of the {'board' if facts.get('board') else 'marker'}, needed {needed}"
+            )
+    return marks, notes
+
+
+def marks_of_photos(facts: dict[str, Any], view_photos: list[Frame], lens: Camera) -> dict[str, list[Seen]]:
+    """Markers in further photographs of the plate's camera, which help to map several of unknown layout; else none."""
+    if len(facts.get("marker") or []) < 2 or facts.get("board") or (facts.get("views") or {}).get("own_camera", False):
+        return {}
+    root = Path(facts["capture_root"])
+    return {photo.file: marks_in(facts, linear_of(root / photo.file), lens)[0] for photo in view_photos}
+
+
+def surer(
+    known: KnownLens, marks: dict[str, list[Seen]], tripod: list[str], corner_sigma_px: float, min_ambiguity: float
+) -> tuple[KnownLens, float, int]:
+    """EXIF's lens with what board and markers in the capture's own views say of it, if they say much.
+
+    Returns also chi-square of how far it then lies from EXIF's word, and the number of views; 0 where it is as it was.
+    """
+    shown = {name: seen for name, seen in marks.items() if seen}
+    here = [name for name in ("plate", *tripod) if name in shown][1:]  # the first of them stands for the place
+    shown = {name: seen for name, seen in shown.items() if name not in here}
+    if any(one.marker for seen in shown.values() for one in seen):
+        try:
+            boards = solve(shown, dict.fromkeys(shown, known.camera), corner_sigma_px).done.bundle
+        except (CaptureError, NumericalError):
+            return known, 0.0, 0
+    else:
+        boards = bundle_of_boards(
+            known.camera, {name: seen[0] for name, seen in shown.items()}, corner_sigma_px, min_ambiguity
+        )
+    found = sharpened(known.camera, boards, corner_sigma_px)
+    if found is None:
+        return known, 0.0, 0
+    return KnownLens(found[0], "of EXIF and the boards in view", True), found[1], len(boards.poses)
+
+
 def by_marks(
-    facts: dict[str, Any], asked: list[str], tripod: list[str], look: Look, view_photos: list[Frame], lens: Camera,
+    marks: dict[str, list[Seen]], notes: dict[str, str], asked: list[str], tripod: list[str], route: str, lens: Camera,
     corner_sigma_px: float, min_ambiguity: float,
 ) -> dict[str, View | str]:  # fmt: skip
     """The pose of each view by board or markers, or in words why there is none.
 
     ``asked``: views of the plate's camera; a plate that shows nothing takes the pose of a view of its ``tripod``.
+    ``route``: charuco, or marker, of which there may be several.
     """
-    if len(facts.get("marker") or []) > 1 and not facts.get("board"):
-        estimates = _mapped(facts, asked, tripod, look, view_photos, lens, corner_sigma_px)
+    if any(one.marker for seen in marks.values() for one in seen):
+        estimates = _mapped(marks, asked, tripod, lens, corner_sigma_px)
     else:
-        estimates = {name: _alone(facts, look(name), lens, corner_sigma_px) for name in asked}
-        for name in tripod if "plate" in asked and isinstance(estimates["plate"], str) else []:
-            if isinstance(found := _alone(facts, look(name), lens, corner_sigma_px), Estimate):
-                estimates["plate"] = found
+        estimates = {name: _alone(marks[name], notes.get(name, ""), route, lens, corner_sigma_px) for name in asked}
+        for name in tripod if "plate" in asked and not marks["plate"] else []:
+            if marks[name]:
+                estimates["plate"] = _alone(marks[name], "", route, lens, corner_sigma_px)
                 break
     return {name: _decided(estimate, min_ambiguity) for name, estimate in estimates.items()}
 
@@ -99,43 +168,28 @@ def _decided(estimate: Estimate | str, min_ambiguity: float) -> View | str:
     return view_of(estimate)
 
 
-def _alone(facts: dict[str, Any], radiance: np.ndarray, lens: Camera, sigma_px: float) -> Estimate | str:
+def _alone(marks: list[Seen], note: str, route: str, lens: Camera, sigma_px: float) -> Estimate | str:
     """One view by the board or the only marker."""
-    route = "charuco" if facts.get("board") else "marker"
+    if not marks:
+        return note
+    world_m, px = marks[0].points, marks[0].px
     try:
-        if facts.get("board"):
-            seen = sighted_board(radiance, facts["board"], lens)
-            world_m, px, needed = seen.world_m, seen.px, FEWEST_CORNERS
-        else:
-            marks = marks_in(facts, radiance, lens)[0]
-            world_m, px = (marks[0].points, marks[0].px) if marks else (np.empty((0, 3)), np.empty((0, 2)))
-            needed = 4
-        if len(px) < needed:
-            return f"it shows {len(px)} corners of the {'board' if facts.get('board') else 'marker'}, needed {needed}"
-        return Estimate(
-            route, Sightings(world_m, px, np.arange(len(px)), 0), *resect_plane(lens, world_m, px, sigma_px)
-        )
-    except (CaptureError, NumericalError) as error:
+        best = resect_plane(lens, world_m, px, sigma_px)
+    except NumericalError as error:
         return str(error)
+    return Estimate(route, Sightings(world_m, px, np.arange(len(px)), 0), *best)
 
 
 def _mapped(
-    facts: dict[str, Any], asked: list[str], tripod: list[str], look: Look, view_photos: list[Frame], lens: Camera,
-    sigma_px: float,
-) -> dict[str, Estimate | str]:  # fmt: skip
-    """Several views by markers of unknown layout; further photographs of the plate's camera help to find it."""
-    seen: dict[str, list[Seen]] = {
-        name: marks_in(facts, look(name), lens)[0] for name in dict.fromkeys([*asked, *tripod])
-    }
-    if not (facts.get("views") or {}).get("own_camera", False):
-        root = Path(facts["capture_root"])
-        seen |= {photo.file: marks_in(facts, linear_of(root / photo.file), lens)[0] for photo in view_photos}
+    marks: dict[str, list[Seen]], asked: list[str], tripod: list[str], lens: Camera, sigma_px: float
+) -> dict[str, Estimate | str]:
+    """Several views by markers of unknown layout."""
     try:
-        found = with_tripod(seen, dict.fromkeys(seen, lens), tripod, sigma_px, MOVED_CHI2)[0]
+        found = with_tripod(marks, dict.fromkeys(marks, lens), tripod, sigma_px, MOVED_CHI2)[0]
     except (CaptureError, NumericalError) as error:
         return dict.fromkeys(asked, str(error))
     return {
-        name: map_estimate(found, name, seen[name], lens, sigma_px) if name in found.names
+        name: map_estimate(found, name, marks[name], lens, sigma_px) if name in found.names
         else "it shows no marker that hangs together with the first"
         for name in asked
     }  # fmt: skip

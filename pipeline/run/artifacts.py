@@ -58,7 +58,7 @@ CORRECTIONS = Artifact(
 )
 
 SOURCES = Artifact(
-    "sources", "json", "what further views are needed for: no, lens and cloud, or also the pose of which view",
+    "sources", "json", "what further views are needed for: nothing, lens, pose of which view; EXIF's lens by boards",
     type=Sources,
 )  # fmt: skip
 RECONSTRUCTION = Artifact(
