@@ -3,7 +3,9 @@
 From one focal length without distortion Brown's terms k1, k2, separate fx and fy, p1 p2 and k3, and the rational k4 k5
 k6, are offered in turn, twice; a term stays when held-out photographs gain more than 9 in deviance per parameter (three
 standard errors of a Gaussian) and do so consistently. A fisheye has a ladder of its own, climbed on evidence only, and
-is judged on the same held-out photographs; the model with fewer terms wins a tie.
+is judged on the same held-out photographs, those of the lens that explains most of them: a photograph that speaks
+against a lens must not be left out for it. The model with fewer terms wins a tie; where photographs do not tell two
+families apart that differ over the frame, that is said.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ RATIONAL = LADDER[-1]  # the denominator: nothing to divide where k1 alone expla
 FEWEST_PHOTOS = 3
 SAME_FOCAL = 0.01
 NEEDED_DEVIANCE = 9.0  # gain on held-out photographs, per parameter, that buys a term: three standard errors
+CLEAR = 3.0  # standard errors over photographs from which one family of lenses is told from another
+APART_PX = 1.0  # over the frame, from which it matters which
 NEEDED_CONSISTENCY = 1.0  # and the mean gain of a photograph over its standard error, against a single odd photograph
 GATE = 5.0  # corners, and photographs, beyond this many times the typical residual are left out
 CORNER_SIGMA_PX = 0.1
@@ -71,7 +75,7 @@ def best_lens(photos: Photos, size: tuple[int, int], warnings: list[str]) -> tup
 
     Wide lenses, a fisheye and the rational one from a wide start, are offered on evidence only: a residual or a pattern
     that no board has, photographs that agree with no other lens, a model that ends within the frame, or a denominator
-    that was needed. All are then judged on the photographs that the fisheye's fit keeps.
+    that was needed. All are then judged on the photographs of the wide lens that keeps most.
     """
     said: list[str] = []
     narrow: Climbed | None = None
@@ -85,20 +89,27 @@ def best_lens(photos: Photos, size: tuple[int, int], warnings: list[str]) -> tup
     if narrow is not None and not why:
         return narrow, warnings + said
     try:
-        wide, also = wide_lenses(photos, size)
+        wide = wide_lenses(photos, size)
     except (NumericalError, CaptureError):
         if narrow is None:
             raise failed from None
         return replace(narrow, evidence=[*narrow.evidence, wide_row(narrow, f"{why}; none fits")]), warnings + said
-    best, table = contest([narrow, *wide] if narrow is not None else wide)
-    errors = {key: value for one in (narrow, *wide) if one is not None for key, value in one.errors.items()}
+    entrants = [one for one in (narrow, *(lens for lens, _ in wide)) if one is not None]
+    best, table, doubt = contest(entrants)
+    left_out = next((notes for lens, notes in wide if lens is best), said)
+    errors = {key: value for one in entrants for key, value in one.errors.items()}
     row = wide_row(best, f"{why}; held-out error " + ", ".join(table))
-    return replace(best, errors=errors, evidence=[*best.evidence, row]), warnings + (said if best is narrow else also)
+    return replace(best, errors=errors, evidence=[*best.evidence, row]), [*warnings, *left_out, *doubt]
 
 
-def contest(entrants: list[Climbed]) -> tuple[Climbed, list[str]]:
-    """The best of several on the last one's photographs, fewer terms first, and the table of their errors in words."""
-    photos, poses = entrants[-1].photos, entrants[-1].fit.poses
+def contest(entrants: list[Climbed]) -> tuple[Climbed, list[str], list[str]]:
+    """The best of several, fewer terms first; the table of their errors, and what leaves it open, in words.
+
+    They are judged on the photographs of the wide one that keeps most of them.
+    """
+    most = max((one for one in entrants if model_of(one.fit.camera.distortion) != "brown"), default=entrants[-1],
+               key=lambda one: len(one.photos.files))  # fmt: skip
+    photos, poses = most.photos, most.fit.poses
     corners = np.array([len(px) for px in photos.px])
     held = [held_out(one.fit.camera, poses, photos, one.terms) for one in entrants]
     order = sorted(range(len(entrants)), key=lambda n: len(entrants[n].terms))
@@ -112,7 +123,32 @@ def contest(entrants: list[Climbed]) -> tuple[Climbed, list[str]]:
         f"{np.sqrt(error.mean()):.4f} px as {model_of(one.fit.camera.distortion)} ({' '.join(one.terms) or 'no terms'})"
         for one, error in zip(entrants, held, strict=True)
     ]
-    return entrants[best], table
+    return entrants[best], table, undecided(entrants, held, best, corners)
+
+
+def undecided(entrants: list[Climbed], held: list[np.ndarray], best: int, corners: np.ndarray) -> list[str]:
+    """The warning that another family of lenses explains the photographs as well, and where it would matter.
+
+    ``held``: of each entrant, by photograph; ``corners``: how many each photograph shows. A fisheye that needed all its
+    terms and that no rational lens could be compared with is one such.
+    """
+    lens = entrants[best].fit.camera
+    families = [model_of(one.fit.camera.distortion) for one in entrants]
+    if families[best] == "fisheye" and "rational" not in families and "k4" in entrants[best].terms:
+        return [
+            f"calibrate: a fisheye was taken as {len(corners)} photographs do not fix a rational lens to compare it "
+            "with; where no board was seen the two may differ by tens of px: photograph boards there, 20 or more in all"
+        ]
+    for one, family, error in zip(entrants, families, held, strict=True):
+        gain, consistency = improvement(error, held[best], corners)
+        apart = disagreement(lens, one.fit.camera)
+        if family != families[best] and not (gain > NEEDED_DEVIANCE and consistency > CLEAR) and apart > APART_PX:
+            return [
+                f"calibrate: {len(corners)} photographs tell {families[best]} from {family} at {consistency:.1f} sigma "
+                f"only, needed {CLEAR:g}, and the two differ by {apart:.1f} px over the frame; photograph boards where "
+                "none was seen"
+            ]
+    return []
 
 
 def wide_row(best: Climbed, because: str) -> dict[str, Any]:
@@ -137,10 +173,11 @@ def asks_for_wide(found: Climbed, offered: int) -> str:
     return "the rational model was taken" if set(RATIONAL) <= set(found.terms) else ""
 
 
-def wide_lenses(photos: Photos, size: tuple[int, int]) -> tuple[list[Climbed], list[str]]:
-    """The rational lens and the fisheye that the photographs ask for, and warnings of those that were left out.
+def wide_lenses(photos: Photos, size: tuple[int, int]) -> list[tuple[Climbed, list[str]]]:
+    """The rational lens and the fisheye that the photographs ask for, each with warnings of those that it leaves out.
 
-    The fisheye's start: the equidistant lens of ten focal lengths that explains the boards best.
+    The fisheye's start: the equidistant lens of ten focal lengths that explains the boards best. The rational lens
+    starts from the fisheye that was found, on all photographs.
     """
     diagonal = float(np.hypot(*size))
     best: tuple[float, Camera, list[np.ndarray]] | None = None
@@ -165,24 +202,28 @@ def wide_lenses(photos: Photos, size: tuple[int, int]) -> tuple[list[Climbed], l
     kept, poses = drop_bad(best[1], photos, best[2], warnings)
     curved = climb(best[1], poses, kept, FISHEYE_LADDER)
     start = curved.fit.camera.model_copy(update={"distortion": EQUIDISTANT})
+    said: list[str] = []
     try:
-        return [climb(start, curved.fit.poses, kept, WIDE_LADDER), curved], warnings
-    except NumericalError:
-        return [curved], warnings
+        each = zip(best[2], photos.world_m, photos.px, strict=True)
+        through = [minimise(curved.fit.camera, *one) for one in each]
+        own, through = drop_bad(start, photos, through, said, WIDE_LADDER[0])
+        return [(climb(start, through, own, WIDE_LADDER), said), (curved, warnings)]
+    except (NumericalError, CaptureError):
+        return [(curved, warnings)]
 
 
 def drop_bad(
-    start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str]
+    start: Camera, photos: Photos, poses: list[np.ndarray], warnings: list[str], terms: tuple[str, ...] = ("k1", "k2")
 ) -> tuple[Photos, list[np.ndarray]]:
-    """Leave out single wrong corners, and photographs whose residual is far above the typical one."""
-    fit = fit_model(start, poses, photos, ("k1", "k2"))
+    """Leave out single wrong corners, and photographs far off a lens of these ``terms``, compared with the others."""
+    fit = fit_model(start, poses, photos, terms)
     scale = max(robust_scale(np.concatenate(fit.residuals_px)), 0.02)
     rms = np.array([np.sqrt((r**2).mean()) for r in fit.residuals_px])
     limit = GATE * max(float(np.median(rms)), scale)
     bad = [i for i in range(len(rms)) if rms[i] > limit]
     rest = [i for i in range(len(rms)) if i not in bad]
     if bad and len(rest) >= FEWEST_PHOTOS:
-        lens = fit_model(start, [fit.poses[i] for i in rest], photos.only(rest), ("k1", "k2")).camera
+        lens = fit_model(start, [fit.poses[i] for i in rest], photos.only(rest), terms).camera
     for i in bad:
         why = ""
         if len(rest) >= FEWEST_PHOTOS:
