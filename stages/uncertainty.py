@@ -91,10 +91,10 @@ def compute(
     channels: dict[str, np.ndarray] = {}
     for layer, rgb in parts.items():
         channels |= pixels.stored(Raster.split(rgb, layer), level)
-    for mode in modes:  # one at a time: of 24 million pixels each is 288 MB before it is stored
-        whole = np.zeros(picture.shape, np.float32)
-        whole[window] = mode.change
-        channels |= pixels.stored(Raster.split(whole, f"mode_{mode.name}"), level)
+    for mode in modes:
+        for name, values in pixels.stored(Raster.split(mode.change, f"mode_{mode.name}"), level).items():
+            channels[name] = np.zeros(picture.shape[:2], values.dtype)
+            channels[name][window] = values
     header = {"insitu:modes": ",".join(mode.name for mode in modes), "insitu:sigma": SIGMA}
     raster = Raster(channels, ACESCG, header)
     uncovered = not_covered(records)

@@ -114,6 +114,10 @@ def waterfall(
 def stored(layers: dict[str, np.ndarray], level: float) -> dict[str, np.ndarray]:
     """Pictures in 16 bit where the plate's ``level`` leaves them their digits, else in 32; infinity stays infinity."""
     wide = not 1e-2 < level < 1e3
-    kind = np.float32 if wide else np.float16
-    top = np.inf if wide else 65504.0
-    return {name: np.where(np.isfinite(v), np.clip(v, -top, top), v).astype(kind) for name, v in layers.items()}
+    kind, top = (np.float32, np.finfo(np.float32).max) if wide else (np.float16, np.finfo(np.float16).max)
+    kept = {}
+    for name, values in layers.items():
+        kept[name] = np.clip(values.astype(np.float32), -top, top).astype(kind)
+        unknown = ~np.isfinite(values)
+        kept[name][unknown] = values[unknown]
+    return kept

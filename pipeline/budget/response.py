@@ -16,6 +16,7 @@ objects only as far as the ground does not light them.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -145,10 +146,15 @@ class Response:
     whole: Seen
     dim: Seen
 
-    def by_albedo(self, name: str) -> np.ndarray:
-        """(h, w, 3) of the window: d ln X / d ln(albedo) of lost, gained or obj."""
-        share = share_of(getattr(self.dim, name), getattr(self.whole, name))
-        return self.grid.enlarged(np.maximum(1 - share, 0) / (1 - DIMMER))
+    @functools.cached_property
+    def undone(self) -> dict[str, np.ndarray]:
+        """(h, w, 3) of the window for lost, gained and obj: dX / d ln(albedo), which every pattern shares."""
+        found = {}
+        for name in LAYERS:
+            share = share_of(getattr(self.dim, name), getattr(self.whole, name))
+            by_albedo = self.grid.enlarged(np.maximum(1 - share, 0) / (1 - DIMMER))
+            found[name] = by_albedo * getattr(self.layers, name)
+        return found
 
     def of_factor(self, factor: np.ndarray) -> np.ndarray:
         """Change of the composite when all light is brighter by a relative factor (3,)."""
@@ -169,7 +175,6 @@ class Response:
     def _changed(self, shares: dict[str, Any], irradiance_share: np.ndarray, factor: np.ndarray | float) -> np.ndarray:
         """``factor * shares`` of every layer, less what the albedo undoes."""
         parts = [
-            (factor * shares[name] - irradiance_share * self.by_albedo(name)) * getattr(self.layers, name)
-            for name in LAYERS
+            factor * shares[name] * getattr(self.layers, name) - irradiance_share * self.undone[name] for name in LAYERS
         ]
         return self.layers.changed(*parts)

@@ -37,11 +37,15 @@ def mirrored(normals: np.ndarray, to_camera: np.ndarray) -> np.ndarray:
 def widened(environment: np.ndarray, power: float = MATTE_POWER) -> np.ndarray:
     """Map (32, 64, C) of the mean of an environment (H, W, C) over lobes ``cos^power`` about each direction."""
     light = resize_environment(environment, *LIGHT_MAP)
-    ways = latlong_directions(*LOBE_MAP).reshape(-1, 3)
-    weight = np.maximum(ways @ latlong_directions(*LIGHT_MAP).reshape(-1, 3).T, 0) ** power
-    weight *= latlong_solid_angles(*LIGHT_MAP).ravel()
-    mean = weight @ light.reshape(-1, light.shape[-1]) / weight.sum(1, keepdims=True)
-    return mean.reshape(*LOBE_MAP, -1)
+    ways = latlong_directions(*LOBE_MAP)[:, 0]
+    weight = (
+        np.maximum(latlong_directions(*LIGHT_MAP) @ ways.T, 0) ** power * latlong_solid_angles(*LIGHT_MAP)[..., None]
+    )
+    # A lobe of the next column is the same lobe turned by two columns of the light, so one lobe per row is computed.
+    step = LIGHT_MAP[1] // LOBE_MAP[1]
+    turned = np.stack([np.roll(light, -step * column, axis=1) for column in range(LOBE_MAP[1])])
+    mean = np.einsum("ijr,vijc->rvc", weight, turned, optimize=True) / weight.sum((0, 1))[:, None, None]
+    return np.asarray(mean)
 
 
 def pictures(
