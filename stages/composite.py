@@ -21,7 +21,7 @@ from pipeline.run.errors import ArtifactError
 from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
-from pipeline.types import Camera, Emitter, Occluder, Plane, Raster, Result, View
+from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, View
 from stages import knobs
 
 GUARDS = {
@@ -93,16 +93,39 @@ def in_front(occluders: list[Occluder], shape: tuple[int, int]) -> np.ndarray | 
     return None if free is None else 1 - free
 
 
-def unseen_albedo(change: d.Change, camera: Camera, view: View, plane: Plane, albedo: Raster) -> np.ndarray:
-    """(H, W) bool: pixels whose light changes visibly and whose albedo the plate never showed."""
+def unseen_albedo(
+    change: d.Change, camera: Camera, view: View, plane: Plane, albedo: Raster, proxies: list[Proxy]
+) -> np.ndarray:
+    """(H, W) bool: pixels that show the plane, whose light changes visibly and whose albedo the plate never showed.
+
+    A proxy before the plane has an albedo of its own: the plane behind it is not what changes.
+    """
     visible = (np.abs(change.difference) > d.SEEN_CHANGE * change.without).any(-1) & (change.ground > 0)
     result = np.zeros(change.alpha.shape, bool)
     row, column = np.nonzero(visible)
     if "seen" in albedo.channels and len(row):
         points = plane_hits(plane, camera, view.world_from_camera, np.stack([column, row], -1) + 0.5)
         seen = plane_texture(plane, np.repeat(albedo["seen"][..., None], 3, -1), points)[:, 0]
-        result[row, column] = ~(seen >= 0.5)
+        unseen = ~(seen >= 0.5) & np.isfinite(points).all(-1)  # a ray that meets no plane shows a proxy
+        asked = np.flatnonzero(unseen)
+        unseen[asked[hidden_by(proxies, view.world_from_camera[:3, 3], points[asked])]] = False
+        result[row, column] = unseen
     return result
+
+
+def hidden_by(proxies: list[Proxy], eye: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: whether a face of a proxy stands between the eye (3,) and points (N, 3) (Moeller, Trumbore 1997)."""
+    hidden = np.zeros(len(points), bool)
+    rays = points - eye
+    for corners in np.concatenate([p.vertices_m[p.faces] for p in proxies] or [np.zeros((0, 3, 3))]):
+        first, one, two = corners[0], corners[1] - corners[0], corners[2] - corners[0]
+        across = np.cross(rays, two)
+        with np.errstate(divide="ignore", invalid="ignore"):  # along the face: no hit
+            inverse = 1 / (across @ one)
+            u, aside = (across @ (eye - first)) * inverse, np.cross(eye - first, one)
+            v, distance = (rays @ aside) * inverse, (two @ aside) * inverse
+        hidden |= (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0) & (distance < 1 - 1e-6)
+    return hidden
 
 
 def group_layers(change: d.Change, rule: d.Rule, layers: Raster, mask: np.ndarray | None) -> dict[str, d.Layers]:
@@ -165,6 +188,7 @@ def compute(
     albedo: Raster,
     environment: Raster,
     emitters: list[Emitter],
+    proxies: list[Proxy],
     params: knobs.Composite,
 ) -> Result:
     """Composite and display pictures.
@@ -175,7 +199,7 @@ def compute(
     mask = in_front(occluders, plate.shape)
     picture, built, rule = compose(plate, layers, params.kind, mask, params.half)
     change = change_of(layers)
-    unseen = unseen_albedo(change, camera, views["plate"], plane, albedo)
+    unseen = unseen_albedo(change, camera, views["plate"], plane, albedo, proxies)
     built = d.flagged(built, d.UNSEEN_ALBEDO, unseen if mask is None else unseen & (mask < 1))
     channels = {
         **Raster.split(picture),
@@ -256,6 +280,7 @@ STAGE = Stage(
         "albedo": A.ALBEDO,
         "environment": A.ENVIRONMENT,
         "emitters": A.EMITTERS,
+        "proxies": A.LOCAL_PROXIES,
     },
     outputs={"composite": A.COMPOSITE, "display": A.DISPLAY, "plate_display": A.PLATE_DISPLAY},
     live=True,

@@ -11,7 +11,7 @@ from pipeline.light.environment import irradiance
 from pipeline.run.errors import ArtifactError, CaptureError, ManifestError
 from pipeline.run.formats import read_exr, write_exr, write_png
 from pipeline.transport import differential as d
-from pipeline.types import Camera, Emitter, Occluder, Plane, Raster, View
+from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, View
 from stages import composite, knobs
 
 SIZE = (4, 5)
@@ -258,6 +258,7 @@ def world(seed: int, groups: tuple[str, ...] = (), shape: tuple[int, int] = (24,
             {"insitu:groups": ",".join(groups)} if groups else {},
         ),
         "occluders": [],
+        "proxies": [],
         "camera": Camera(width=width, height=height, fx=40.0, fy=40.0, cx=width / 2, cy=height / 2),
         "views": {
             "plate": View(world_from_camera=pose, covariance=np.zeros((6, 6)), route="given", rms_px=0, points=0)
@@ -454,6 +455,15 @@ def test_guards_mark_what_nobody_can_know() -> None:
     assert np.abs(unseen - [5, 8]).max() <= 2
     assert np.isfinite(result.outputs["composite"].rgb()).all()
     assert sum("clipped" in w or "border" in w or "never" in w or "extrapolated" in w for w in result.warnings) == 3
+    # a box's top half way to the plane, over that pixel and no other side of the frame: it is seen, not the plane
+    square = np.array([[-0.1, 0, -0.1], [0.1, 0, -0.1], [0.1, 0, 0.1], [-0.1, 0, 0.1]])
+    top = square + np.array([column / 2, 0.5, row / 2])
+    inputs["proxies"] = [Proxy(name="box", vertices_m=top, faces=[[0, 2, 1], [0, 3, 2]], albedo=[0.5, 0.5, 0.5])]
+    hidden = composite.compute(**inputs, params=knobs.Composite())
+    assert not np.any(hidden.outputs["composite"]["guards"] & d.UNSEEN_ALBEDO)
+    inputs["proxies"] = [inputs["proxies"][0].model_copy(update={"vertices_m": top + np.array([0.5, 0, 0])})]
+    aside = composite.compute(**inputs, params=knobs.Composite()).outputs["composite"]["guards"]
+    np.testing.assert_array_equal(aside, guards)
 
 
 def test_additive_below_zero_is_counted_and_auto_is_not() -> None:
