@@ -1,6 +1,6 @@
 """How right the light is: ``make bench-probe`` writes docs/benchmarks/probe.json, probe.md and probe.svg.
 
-    python -m benchmarks.probe [--parts fit,coverage,unwrap,speed,flux,captures,real] [--out docs/benchmarks]
+    python -m benchmarks.probe [--parts fit,small,coverage,unwrap,speed,flux,captures,real] [--out docs/benchmarks]
 
 Simulated balls over distance, angle and size; a sun clipped in every frame; whole captures with truth; real balls.
 """
@@ -67,6 +67,7 @@ def captures(folder: Path) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[Path], Any]] = {
     "fit": lambda folder: probe_fit.sweep(),
+    "small": lambda folder: probe_fit.small(),
     "coverage": lambda folder: probe_fit.coverage(100),
     "unwrap": lambda folder: probe_unwrap.rows(),
     "speed": lambda folder: probe_unwrap.unwrap_s_24mpx(),

@@ -245,6 +245,43 @@ def sweep(
     return rows
 
 
+def small(balls: int = 20, radii: tuple[float, ...] = (30.0, 40.0, 60.0, 100.0)) -> list[dict[str, float]]:
+    """Rows by radius: errors of ``balls`` drawn balls with a plane, what is stated of them, and whether that is so.
+
+    Keys: radius_px; direction_rms_deg, direction_median_deg, direction_p90_deg and above_1_deg (share) inside r < 0.9;
+    sigma_median_deg, stated; held_95, share of true centres in the stated 95 % region; flagged, share of those above a
+    degree that state more than half a degree.
+    """
+    rows = []
+    with ProcessPoolExecutor() as pool:
+        for size in radii:
+            rng = np.random.default_rng(int(size))
+            jobs = [
+                Setup(
+                    distance_ratio=float(np.exp(rng.uniform(np.log(5), np.log(30)))), off_axis_deg=rng.uniform(0, 20),
+                    radius_px=size, blur_px=rng.uniform(0.4, 1.2), seed=3000 + k, margin=MARGIN,
+                )
+                for k in range(balls)
+            ]  # fmt: skip
+            found = list(pool.map(_on_plane, jobs))
+            error, sigma, square = (
+                np.array([one[key] for one in found])
+                for key in ("direction_rms_deg", "direction_sigma_deg", "mahalanobis_squared")
+            )
+            far = error > 1
+            rows.append(
+                {
+                    "radius_px": size, "balls": balls, "direction_rms_deg": float(np.sqrt(np.mean(error**2))),
+                    "direction_median_deg": float(np.median(error)),
+                    "direction_p90_deg": float(np.quantile(error, 0.9)),
+                    "above_1_deg": float(far.mean()), "sigma_median_deg": float(np.median(sigma)),
+                    "held_95": float((square < 7.815).mean()),
+                    "flagged": float((sigma[far] > 0.5).mean()) if far.any() else 1.0,
+                }
+            )  # fmt: skip
+    return rows
+
+
 def coverage(count: int = 200, first: int = 0) -> dict[str, float]:
     """Share of simulated balls whose 95 % region of the centre holds the truth, over distance, angle, blur, contrast"""
     found = []

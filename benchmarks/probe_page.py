@@ -182,6 +182,19 @@ def write_page(record: dict[str, Any], folder: Path) -> None:
         f"radius, {cover['held_95']:.0%} have their true centre in the stated 95 % region, {cover['held_68']:.0%} in "
         "that of 68 %.",
         "",
+        "## Small balls",
+        "",
+        "With the plane, 5 to 30 radii away, up to 20 degrees off the axis, blurred by 0.4 to 1.2 px; degrees.",
+        "",
+        "| radius [px] | balls | rms | median | 90 % | above 1° | stated, median | in the stated 95 % region |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        *[
+            f"| {row['radius_px']:g} | {row['balls']} | {row['direction_rms_deg']:.2f} "
+            f"| {row['direction_median_deg']:.2f} | {row['direction_p90_deg']:.2f} | {row['above_1_deg']:.0%} "
+            f"| {row['sigma_median_deg']:.2f} | {row['held_95']:.0%} |"
+            for row in record["small"]
+        ],
+        "",
         "## Unwrap",
         "",
         "| radius [px] | distance / R | method | irradiance with sun | sky alone | sun | CPU s |",

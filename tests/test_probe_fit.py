@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.probe_fit import RADIUS, Setup, fitted, orthographic_rms_deg, picture, scene
+from benchmarks.probe_fit import RADIUS, Setup, direction_rms_deg, fitted, orthographic_rms_deg, picture, scene
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes import seeds, sphere_fit
-from pipeline.probes.finding import measured, signals_of
+from pipeline.probes.finding import measured, needed_merit, signals_of
 from pipeline.probes.outline import Height, radius_in_pixels
+from pipeline.probes.reflection import direction_sigma
+from pipeline.types import Camera
 
 
 @pytest.mark.parametrize(
@@ -69,3 +71,38 @@ def test_radius_is_solved_from_the_plane(shot):
     radius, sigma = sphere_fit.radius_on_plane(free, wrong, height)
     assert abs(radius - RADIUS) < 4 * sigma
     assert sigma < 0.05 * RADIUS
+
+
+def test_what_chance_reaches_falls_with_the_size_and_grows_with_the_search():
+    """The measured law of false alarms: a ball of 57 px that half its azimuths see is one where another view has it."""
+    fit = lambda size, visible=1.0: sphere_fit.SphereFit(  # noqa: E731
+        np.zeros(3), np.eye(3), 0.2, 50, size, 0.8, 0.5, 2.0, visible
+    )
+    ways = [needed_merit(way, fit(57.0)) for way in ("click", "other_view", "plane", "anywhere")]
+    assert ways == sorted(ways)
+    assert ways[1] < 0.5 < ways[2] < 0.6  # the courtyard's second ball: 0.51, beside the first one's place
+    assert needed_merit("plane", fit(76.0)) == pytest.approx(7.0 / np.sqrt(238))
+    assert needed_merit("plane", fit(30.0)) == 0.65  # small outlines: more than any false one had
+    assert needed_merit("plane", fit(76.0, 0.5)) == pytest.approx(np.sqrt(2) * needed_merit("plane", fit(76.0)))
+
+
+@pytest.mark.parametrize("half", [0.0, 0.5])
+def test_black_of_eight_bits_is_no_crash(half):
+    """Sectors that are exactly zero have no level to be measured by; an outline on nothing but zero is none."""
+    picture = np.zeros((120, 120, 3))
+    picture[:, :60] = half
+    camera = Camera(width=120, height=120, fx=400, fy=400, cx=60, cy=60)
+    start, everywhere = np.array([0, 0, 0.4]), np.ones((120, 120), bool)
+    fit, _ = sphere_fit.fit_sphere(picture, 1e-6 + 0 * picture, everywhere, camera, 0.04, start, None)
+    assert np.isfinite(fit.centre).all()
+    assert half > 0 or not fit.rms_px < 1.0
+
+
+def test_the_stated_direction_is_that_of_drawn_centres():
+    """`direction_sigma` against centres drawn from the covariance: 12 draws, so to a fifth."""
+    centre = np.array([0.02, -0.01, 0.4])
+    root = np.diag([1e-4, 2e-4, 6e-4])
+    rng = np.random.default_rng(0)
+    drawn = [direction_rms_deg(centre + root @ rng.normal(size=3), centre) for _ in range(60)]
+    stated = np.degrees(direction_sigma(centre, root @ root.T, RADIUS))
+    assert stated == pytest.approx(np.sqrt(np.mean(np.square(drawn))), rel=0.15)

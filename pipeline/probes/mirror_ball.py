@@ -24,13 +24,14 @@ from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.outline import part_of
 from pipeline.probes.parallax import set_down
-from pipeline.probes.reflection import deviation, radians_per_pixel
+from pipeline.probes.reflection import deviation, direction_sigma, radians_per_pixel
 from pipeline.probes.unwrap import displaced_variance, unwrap
 from pipeline.run.errors import CaptureError
 from pipeline.types import BallFit, Camera, Raster, View
 
 PIXEL_SIGMA = 0.5  # px: half-width of pixel and lookup, for the angular resolution of a texel
 MIN_RIM, EDGE_PX = 0.8, 2.0
+FLAG_DIRECTION_DEG = 1.0
 SURFACE_RIM = 0.97  # for measuring the reflectance
 # Of a radius by the rim and the plane's height: what it states, against its error on five views of three captures
 # (-3.7, -1.9, 0.8, -1.2, -0.1 sigma): a rim drifts with its background on one side.
@@ -99,6 +100,11 @@ class MirrorBall:
         }
         for name, anchor in anchors.items():
             numbers[name]["mirrored_plane"] = anchor
+            if (sigma := numbers[name]["direction_sigma_deg"]) > FLAG_DIRECTION_DEG:
+                warnings.append(
+                    f"{name}: directions are known to {sigma:.1f} degrees, ball of {found[name].fit.radius_px:.0f} px; "
+                    "go nearer, or let it mirror print"
+                )
         balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
         evidence = [*reasons(found), centred(anchors), photographer.reason(people, len(maps)), *known.evidence]
@@ -305,6 +311,7 @@ def fit_numbers(ball: Found, radius: float, glass: Glass | None = None) -> dict[
         "rim_blur_px": fit.blur_px, "outline_support": fit.support, "outline_contrast": fit.contrast,
         "outline_in_frame": fit.visible, "height_discrepancy_mm": 1e3 * gap,
         "height_discrepancy_sigma_mm": 1e3 * gap_sigma,
+        "direction_sigma_deg": float(np.degrees(direction_sigma(fit.centre, fit.covariance, radius, glass))),
         "blind_half_angle_deg": float(np.degrees(max(blind, 0.0))),
     }  # fmt: skip
 

@@ -72,6 +72,28 @@ def rays_from_directions(
     return along[..., None] * directions - back[..., None] * to_camera, sine
 
 
+def direction_sigma(
+    centre: np.ndarray, covariance: np.ndarray, radius: float, glass: Glass | None = None, rim: float = 0.9
+) -> float:
+    """Rms error [rad] to be expected of directions over the disc inside ``rim``, of a centre (3,) with covariance.
+
+    One displacement along each principal axis of ``covariance`` (3, 3) [m^2], by its sigma; to first order.
+    """
+    distance = float(np.linalg.norm(centre))
+    first, second = np.linalg.svd(centre[None] / distance)[2][1:]
+    r, angle = rim * np.sqrt((np.arange(200) + 0.5) / 200), 2.4 * np.arange(200)  # the golden angle: even over the area
+    sine = (r * radius / distance)[:, None]
+    spokes = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
+    rays = np.sqrt(1 - sine**2) * centre / distance + sine * spokes
+    there = directions_from_rays(rays, centre, radius, glass)
+    size, axes = np.linalg.eigh(covariance)
+    total, step = 0.0, 1e-4 * radius
+    for variance, axis in zip(size, axes.T, strict=True):
+        moved = directions_from_rays(rays, centre + step * axis, radius, glass)
+        total += max(float(variance), 0.0) * float(np.nanmean(((moved - there) ** 2).sum(1))) / step**2
+    return float(np.sqrt(total))
+
+
 def first_slope(ratio: float, glass: Glass | None) -> float:
     """Derivative of `deviation` by the sine, head on."""
     return 2 - ratio + (0.0 if glass is None else float(glass.turn_slope(np.array(0.0))))

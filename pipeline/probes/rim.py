@@ -34,6 +34,7 @@ INNER_TERMS, OUTER_TERMS = 5, 3
 GRID = 0.04  # of the profiles' table, in blurs
 SCATTER, CAUCHY = 0.2, 5.0  # of the sectors' median disagreement: what none knows better, and what is astray
 STUDENT = 4.0  # degrees of freedom that the noise model has in a sector's weight
+DARKEST = 1e-4  # sector, over the outline's median
 MODEL_REL = 1e-3  # of the radiance: no model of the light is better than this
 # What the sectors have in common that the sandwich cannot see, in blurs: a common inset, and a drift to one side.
 # Measured over simulated balls by `benchmarks.probe_fit.coverage`. A drift evens out over the outline less when the
@@ -123,7 +124,8 @@ def gather(
     there = use[..., None]
     rays, by_px = _rays(camera, np.where(there, np.stack([column, row], -1) + 0.5, px[kept][:, None]))
     values = np.where(there, picture[row, column], 0).astype(float)
-    level = np.maximum(np.nanmedian(np.where(there, np.abs(values), np.nan), 1), 1e-30)
+    level = np.nanmedian(np.where(there, np.abs(values), np.nan), 1)
+    level = np.maximum(level, max(DARKEST * float(np.median(level)), 1e-30))  # pictures of 8 bits have sectors of 0
     noise = np.where(there, variance[row, column], 0).sum(1) / use.sum(1)[:, None] / level**2
     return Patches(
         rays, by_px, values / level[:, None], use.astype(float), along, noise + MODEL_REL**2, inner, outer, count
@@ -208,7 +210,9 @@ def fit_rim(
         normal[3, 3] += 1 / BLUR_LOG_SIGMA**2
         pull[3] += np.log(blur / BLUR_PX) / BLUR_LOG_SIGMA**2
         held = normal + 1e-6 * np.trace(normal) * np.eye(4)
-        step = np.linalg.solve(held, pull)
+        step = np.linalg.solve(held, pull) if np.isfinite(held).all() else np.full(4, np.nan)
+        if not np.isfinite(step).all():  # black all around: nothing to fit
+            return RimFit(np.full(3, np.nan), blur, np.full((4, 4), np.inf), np.inf, len(patches.use), False)
         step[:3] *= min(1.0, 1.0 / max(np.abs(step[:3]).max(), 1e-12))  # a pixel at a time
         step[3] = np.clip(step[3], -0.3, 0.3)
         centre = centre - frame.T @ (scale * step[:3])

@@ -221,6 +221,11 @@ def _around(camera: Camera, centre: np.ndarray, radius: float) -> tuple[tuple[sl
     return (slice(low[1], high[1]), slice(low[0], high[0])), part_of(camera, low, high)
 
 
+def azimuth_count(size: float) -> int:
+    """How many azimuths of an outline of ``size`` px in radius are asked."""
+    return int(np.clip(np.pi * size, 48, 240))
+
+
 def coverage(signals: list[np.ndarray], camera: Camera, centre: np.ndarray, radius: float) -> tuple[float, float]:
     """Share of the outline's azimuths, in frame, that vote for it rather than for outlines around it; and chance's.
 
@@ -230,7 +235,7 @@ def coverage(signals: list[np.ndarray], camera: Camera, centre: np.ndarray, radi
     """
     size = radius_in_pixels(camera, centre, radius)
     pitch = min(3.0, 0.12 * size)
-    azimuth = azimuths(int(np.clip(np.pi * size, 48, 240)))
+    azimuth = azimuths(azimuth_count(size))
     shifts = pitch * np.arange(5)
     near = np.array([-0.8, 0.0, 0.8]) * min(1.0, size / 40)
     places = np.array([centre * size / (size + d + e) for d in shifts for e in near])

@@ -77,6 +77,8 @@ def fit_sphere(
             break
         found = rim.fit_rim(patches, camera, centre, radius, blur)
         centre, blur = found.centre, found.blur_px
+        if not np.isfinite(centre).all():
+            break
     size = radius_in_pixels(camera, centre, radius)
     if found is None or not np.isfinite(centre).all():
         nothing = np.full((3, 3), np.inf)
