@@ -277,6 +277,19 @@ def test_filled_light_grows_uncertain_with_distance_and_a_lamp_is_counted():
     assert not filling.reason(filling.report(truth, np.ones(known.shape), None), None)["modelled"]
 
 
+def test_noise_about_zero_is_no_measure_of_a_fill():
+    """A side that is black but for noise of both signs, one channel as well: errors stay below that of no light."""
+    rng = np.random.default_rng(5)
+    truth = on_map(textured(rng, []), HEIGHT)
+    dark = latlong_directions(HEIGHT, WIDTH)[..., 0] > 0.2
+    truth[dark] = 1e-6 * np.median(truth) * rng.normal(size=(int(dark.sum()), 3))
+    known = np.where(latlong_directions(HEIGHT, WIDTH)[..., 2] < -np.cos(np.radians(15)), 0.0, 1.0)
+    prior = filling.prior(truth, known)
+    assert prior is not None
+    assert prior.trials > 0
+    assert prior.sigma_rel.max() < filling.LAMP
+
+
 def test_a_gap_too_wide_for_trials_takes_the_contrast_of_the_map():
     truth = on_map(textured(np.random.default_rng(4), [], 12), 32)
     known = np.where(latlong_directions(32, 64)[..., 1] > -0.2, 1.0, 0.0)

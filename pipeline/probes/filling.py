@@ -24,6 +24,7 @@ TILTS = (45.0, 90.0, 135.0)  # degrees, when the vertical does not give enough
 LEAST_TRIALS = 4
 CLEAR = 0.9  # of a trial gap that must have been seen
 LAMP = 20.0  # times the fill: what a smooth prior cannot mean
+DARK = 0.01  # of the map's median: a fill below it is noise, and no measure of an error
 BINS = 6
 
 
@@ -101,12 +102,13 @@ def _trials(rgb: np.ndarray, kept: np.ndarray) -> tuple[list[np.ndarray], list[n
     gap, solid = kept < 0.5, latlong_solid_angles(*kept.shape)[..., None]
     distances: list[np.ndarray] = []
     errors, light, lamps = [], [], 0
+    floor = np.maximum(DARK * np.median(rgb[~gap], axis=0), 1e-12) if not gap.all() else 1e-12
     for trial in _turned(gap) if gap.any() else ():
         hole = trial & ~gap
         if (solid[..., 0] * hole).sum() < CLEAR * (solid[..., 0] * trial).sum():
             continue
         guess = fill(rgb, kept * ~trial)[hole]
-        relative = rgb[hole] / np.maximum(guess, 1e-12) - 1
+        relative = (rgb[hole] - guess) / np.maximum(guess, floor)
         if relative.max() > LAMP:
             lamps += 1
             continue
