@@ -143,7 +143,7 @@ def with_one_lens(number: int) -> dict[str, Any]:
         radiance = rendered(printed, true, rng)
         for name, camera in (("true_lens", CAMERA), ("calibrated_lens", lens)):
             seen = sighted_board(radiance, BOARD, camera)
-            best, _, _ = resect_plane(camera, seen.world_m, seen.px, SIGMA_PX)
+            best, _, _ = resect_plane(camera, seen.world_m, seen.px, SIGMA_PX, True)
             rows[name].append(errors_of(best, camera, true, CENTRE))
         corners.append(seen.px - project(CAMERA, camera_points(true, seen.world_m)[0]))
     focal = {

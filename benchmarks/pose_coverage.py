@@ -77,9 +77,11 @@ def aimed(rng: np.random.Generator, target: np.ndarray, tilts: tuple[float, floa
     return pose @ perturb(np.eye(4), np.array([*rng.uniform(-0.12, 0.12, 2), 0, 0, 0, 0]))
 
 
-def plane_route(rng: np.random.Generator, camera: Camera, points: np.ndarray, pose: np.ndarray) -> float | None:
-    """Mahalanobis distance of the pose of a plane's points; None when it is ambiguous."""
-    best, _, ambiguity = resect_plane(camera, points, measured(rng, pose, points), SIGMA_PX)
+def plane_route(
+    rng: np.random.Generator, camera: Camera, points: np.ndarray, pose: np.ndarray, sharp: bool = False
+) -> float | None:
+    """Mahalanobis distance of the pose of a plane's points, ``sharp`` those of a board; None when it is ambiguous."""
+    best, _, ambiguity = resect_plane(camera, points, measured(rng, pose, points), SIGMA_PX, sharp)
     return mahalanobis(best.world_from_camera, best.covariance, pose) if ambiguity >= LEAST_RATIO else None
 
 
@@ -96,7 +98,7 @@ def board(rng: np.random.Generator, camera: Camera, fewest: int = len(BOARD)) ->
     if fewest < len(BOARD):  # what an object hides: the corners nearest to a place are gone
         away = np.linalg.norm(BOARD - BOARD[rng.integers(len(BOARD))], axis=1)
         chosen = BOARD[np.argsort(-away)[: rng.integers(fewest, len(BOARD))]]
-    return plane_route(rng, camera, chosen, pose)
+    return plane_route(rng, camera, chosen, pose, True)
 
 
 def points(rng: np.random.Generator, camera: Camera) -> float | None:

@@ -27,11 +27,11 @@ METHOD = """## Method
   lens, on the same photographs. A pose more than 10 degrees off is a flip.
 - **Coverage**: corners and tracks with noise, every other lens drawn from a calibration's covariance; the squared error
   of the six numbers in units of their own covariance is held against chi-square's 95 %; of poses that are not refused.
-  Corners have the noise that stage pose assumes (knob `corner_sigma_px`).
+  Corners have the noise that stage pose assumes where no board tells it (knob `corner_sigma_px`).
 - **Herzjesu**: K and poses of the set. Rotations after one similarity over centres and rotations, each over its own rms
   residual; centres after the similarity of the centres alone. They lie within 16, 2.2 and 0.3 m (singular values), so
   that they leave the turn about their line open: millimetres of centres turn all cameras alike (last column).
-- **Abakisita**: every third photograph; the board's poses by its corners and the lens that they give, COLMAP's by its
+- **Abakisita**: all 42 photographs; the board's poses by its corners and the lens that they give, COLMAP's by its
   own tracks and the lens that they give; centres after a similarity, over the distance to the board.
 """
 

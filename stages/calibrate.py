@@ -59,8 +59,11 @@ def compute(
         camera, numbers, warnings, evidence = exif_camera(_known(frame), lens_name)
         if sources.lens is not None:
             camera = sources.lens
-            relative = float(np.sqrt(camera.covariance[0, 0]) / camera.fx)
-            numbers |= {"source": camera.source, "focal_sigma_rel": relative, "rms_px": camera.rms_px}
+            sigma = np.sqrt(np.diag(camera.covariance))
+            relative = float(sigma[0] / camera.fx)
+            numbers |= {"source": camera.source, "focal_sigma_rel": relative, "rms_px": camera.rms_px,
+                        "principal_point_sigma_px": sigma[2:4].tolist()}  # fmt: skip
+            del numbers["corner_sigma_rel"]
             warnings = few_boards(relative)
         whole = Result({"camera": camera}, numbers, warnings, evidence)
     cameras: dict[str, Camera] = {}

@@ -6,12 +6,12 @@ and Bartoli 2014) are refined; when the second is nearly as good, a further mark
 diameter that stands on the plane of one, else the view is refused with both. Several markers are mapped from all views
 (`pipeline/camera/marker_map.py`). Surveyed points start by LO-RANSAC (COLMAP) and count by their own uncertainty. Views
 that show no marker are oriented by what they share with further photographs: tracks of the cloud and markers seen in
-any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse normal matrix times the larger of
-the stated corner variance and chi2 per degree of freedom, plus the camera's covariance carried through; corners are
-taken as independent. Views from one tripod position are tested for having stayed (chi2 of the difference) and then
-share one pose, estimated from their averaged corners. A plate without the board gets its pose from a tripod view that
-shows it and from how far both pictures say that the camera turned. Limits: a flat board of the stated size; a wrong
-size scales the world unnoticed.
+any of them are adjusted together (`pipeline/camera/bundle.py`). Covariance: inverse normal matrix times the variance of
+a corner, plus the camera's covariance carried through; corners are taken as independent. That variance is what the
+residuals of 13 corners of a board tell, elsewhere the larger of the stated one and chi2 per degree of freedom. Views
+from one tripod position are tested for having stayed (chi2 of the difference) and then share one pose, estimated from
+their averaged corners. A plate without the board gets its pose from a tripod view that shows it and from how far both
+pictures say that the camera turned. Limits: a flat board of the stated size; a wrong size scales the world unnoticed.
 """
 
 from __future__ import annotations
@@ -314,7 +314,9 @@ def estimate_view(
                 f"markers read), needed {needed}; {seen.note or 'check dictionary, id and legacy in the manifest'}, or "
                 "photograph it unobstructed, sharp and larger in the frame, or orient the view by a [[pose]] entry"
             )
-        best, second, ambiguity = resect_plane(camera, seen.world_m, seen.px, params.corner_sigma_px)
+        best, second, ambiguity = resect_plane(
+            camera, seen.world_m, seen.px, params.corner_sigma_px, route == "charuco"
+        )
         estimate = Estimate(route, seen, best, second, ambiguity)
     except (CaptureError, NumericalError) as error:
         raise type(error)(f"{name}: {error}") from error

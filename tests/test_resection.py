@@ -10,7 +10,7 @@ from pipeline.camera.adjustment import free_columns
 from pipeline.camera.colmap_bridge import pose_of_points
 from pipeline.camera.lens import project
 from pipeline.camera.markers import marker_points
-from pipeline.camera.resection import is_planar, refine, resect_plane
+from pipeline.camera.resection import corner_noise, is_planar, refine, resect_plane
 from pipeline.camera.rigid import camera_points, difference
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
@@ -66,6 +66,24 @@ def test_board_coverage_and_accuracy(lens_known: bool) -> None:
     if lens_known:  # the brief's figures for a board about 480 px wide
         assert np.median(rotation_deg) < 0.05
         assert np.median(position) < 1e-3
+
+
+def test_a_boards_residuals_tell_its_corners_noise() -> None:
+    """Corners of 0.04 px where 0.1 is stated: the region is as wide as 0.04 asks for, and what corners may share.
+
+    Mean chi2 of 120 boards: 6 for six numbers, less the share of 24 x 0.005^2 in 0.04^2 (4.5), +- 0.3. With the stated
+    noise it is 1. Fewer than 13 corners tell too little: there the stated one stays.
+    """
+    rng, found = np.random.default_rng(8), []
+    for _ in range(120):
+        pose = random_pose(rng, (20, 60), 0.45)
+        best, _, _ = resect_plane(CAMERA, BOARD, seen(BOARD, pose, rng, 0.04), SIGMA, True)
+        delta = difference(best.world_from_camera, pose)
+        found.append(float(delta @ np.linalg.solve(best.covariance, delta)))
+    assert 3.6 < np.mean(found) < 5.4
+    assert np.mean(np.array(found) < CHI2_95) > LOW
+    assert corner_noise(12 * 2 * 0.04**2, 12, SIGMA, True) == SIGMA
+    assert corner_noise(24 * 2 * 0.2**2, 24, SIGMA, True) > 0.2  # worse than stated is told as well
 
 
 def test_board_coverage_at_all_tilts() -> None:

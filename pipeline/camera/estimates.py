@@ -126,7 +126,9 @@ def settle_tripod(
             continue
         if len(seen.px) < (4 if plate.route == "marker" else FEWEST_CORNERS):
             continue
-        own = refine(camera, plate.best.world_from_camera, seen.world_m, seen.px, corner_sigma_px)
+        own = refine(
+            camera, plate.best.world_from_camera, seen.world_m, seen.px, corner_sigma_px, sharp=plate.route == "charuco"
+        )
         apart = difference(own.world_from_camera, plate.best.world_from_camera)
         chi2 = float(apart @ np.linalg.solve(own.noise_covariance + plate.best.noise_covariance, apart))
         shift = [project(camera, camera_points(pose, seen.world_m)[0]) for pose in
@@ -139,12 +141,12 @@ def settle_tripod(
         estimates[name] = Estimate(plate.route, seen, own, None, np.inf)
         views[name] = view_of(estimates[name])
     if plate is not None and pool:
-        seen = averaged([plate.seen, *pool])
+        seen, sharp = averaged([plate.seen, *pool]), plate.route == "charuco"
         if plate.decided:  # the corners alone may prefer the other pose
-            own = refine(camera, plate.best.world_from_camera, seen.world_m, seen.px, corner_sigma_px)
+            own = refine(camera, plate.best.world_from_camera, seen.world_m, seen.px, corner_sigma_px, sharp=sharp)
             estimates["plate"] = replace(plate, seen=seen, best=own)
         else:
-            found = resect_plane(camera, seen.world_m, seen.px, corner_sigma_px)
+            found = resect_plane(camera, seen.world_m, seen.px, corner_sigma_px, sharp)
             estimates["plate"] = Estimate(plate.route, seen, *found)
         views["plate"] = view_of(estimates["plate"])
     for name in names:

@@ -22,6 +22,8 @@ HUBER = 2.0  # residuals beyond this many sigma lose weight while searching
 GATE = 5.0  # and beyond this many are left out of the final fit
 GATE_POINTS = 8  # with fewer points an outlier cannot be told from a bad pose
 FRONTAL = 3.0  # tilts below this many of their own sigma (seen squarely) are not Gaussian
+TELLING = 13  # corners of a board, from which their residuals tell their noise better than a rule does
+SHARED_PX = 0.005  # of a corner's error that all corners of a picture may have in common: blur, tone curve, paper
 FLAT = 1e-3  # points whose least extent is below this fraction of the largest are one plane
 
 
@@ -115,11 +117,12 @@ def refine(
     px: np.ndarray,
     sigma_px: float,
     kept: np.ndarray | None = None,
+    sharp: bool = False,
 ) -> Resection:
     """Refine a pose (4, 4) on points (N, 3) and pixels (N, 2); without ``kept`` outliers are found here.
 
-    The covariance assumes the larger of ``sigma_px`` and what the residuals show, independent between points, and
-    includes the camera's own covariance. Raises NumericalError when the points do not fix the pose.
+    The covariance assumes `corner_noise`, independent between points, and includes the camera's own covariance.
+    ``sharp``: the points are X corners of a board. Raises NumericalError when the points do not fix the pose.
     """
     pose = start
     if kept is None:
@@ -134,11 +137,24 @@ def refine(
     pose = minimise(camera, pose, world_points[kept], px[kept])
     residuals, jacobian, by_lens = residuals_and_jacobian(camera, pose, world_points, px)
     squares = float((residuals[kept] ** 2).sum())
-    sigma = max(sigma_px, np.sqrt(squares / max(2 * kept.sum() - 6, 1)))
+    sigma = corner_noise(squares, int(kept.sum()), sigma_px, sharp)
     by_noise, by_lens_part, with_lens = pose_covariance(jacobian[kept], by_lens[kept], camera.covariance)
     noise = sigma**2 * by_noise
     covariance = noise + by_lens_part
     return Resection(pose, covariance, noise, with_lens, residuals, kept, float(sigma), squares / sigma_px**2)
+
+
+def corner_noise(squares: float, count: int, sigma_px: float, sharp: bool) -> float:
+    """Standard uncertainty of a coordinate, px, from the sum of squared residuals of ``count`` corners.
+
+    The larger of ``sigma_px`` and chi2 per degree of freedom; of X corners (``sharp``) in number what the residuals
+    say alone: their variance over the degrees of freedom less two, which makes the Gaussian region of the pose as wide
+    as Student's, and what all may have in common, which averaging over them does not lessen.
+    """
+    freedom = 2 * count - 6
+    if sharp and count >= TELLING:
+        return float(np.sqrt(squares / (freedom - 2) + count * SHARED_PX**2))
+    return float(max(sigma_px, np.sqrt(squares / max(freedom, 1))))
 
 
 def pose_covariance(
@@ -197,23 +213,26 @@ def is_planar(world_points: np.ndarray) -> bool:
 
 
 def resect_plane(
-    camera: Camera, world_points: np.ndarray, px: np.ndarray, sigma_px: float
+    camera: Camera, world_points: np.ndarray, px: np.ndarray, sigma_px: float, sharp: bool = False
 ) -> tuple[Resection, Resection | None, float]:
     """Best pose of coplanar points, the second one (None when both starts meet), and the ambiguity.
+
+    ``sharp``: as in `refine`.
 
     The ambiguity is chi2 of the second over the larger of chi2 of the first and its degrees of freedom, so that a lucky
     fit of few points does not look decisive. Candidates nearer to each other than their own uncertainty are one pose.
     """
     candidates = [
-        refine(camera, start, world_points, px, sigma_px) for start in planar_candidates(camera, world_points, px)
+        refine(camera, start, world_points, px, sigma_px, sharp=sharp)
+        for start in planar_candidates(camera, world_points, px)
     ]
     candidates.sort(key=lambda c: robust_cost(c.residuals_px, sigma_px))
     best = candidates[0]
     if len(candidates) == 1:
         return widened(camera, world_points, best), None, np.inf
-    second = refine(camera, candidates[1].world_from_camera, world_points, px, sigma_px, best.kept)
+    second = refine(camera, candidates[1].world_from_camera, world_points, px, sigma_px, best.kept, sharp)
     if second.chi2 < best.chi2:
-        best, second = second, refine(camera, best.world_from_camera, world_points, px, sigma_px, best.kept)
+        best, second = second, refine(camera, best.world_from_camera, world_points, px, sigma_px, best.kept, sharp)
     apart = difference(second.world_from_camera, best.world_from_camera)
     if apart @ np.linalg.solve(best.covariance, apart) < 1:
         return widened(camera, world_points, best), None, np.inf

@@ -174,7 +174,7 @@ def _alone(marks: list[Seen], note: str, route: str, lens: Camera, sigma_px: flo
         return note
     world_m, px = marks[0].points, marks[0].px
     try:
-        best = resect_plane(lens, world_m, px, sigma_px)
+        best = resect_plane(lens, world_m, px, sigma_px, route == "charuco")
     except NumericalError as error:
         return str(error)
     return Estimate(route, Sightings(world_m, px, np.arange(len(px)), 0), *best)
