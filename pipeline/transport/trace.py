@@ -241,12 +241,17 @@ def camera_hits(worlds: Worlds, rays: Rays, samples: int, jitter: Any, footprint
     return ray, hit, seen & ~local, seen & local
 
 
-def reference_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float) -> Samples:
-    """The reference strategy: LS_obj and LS_noobj path traced in full, with the same random numbers."""
+def reference_block(
+    worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float, roulette: int = NEVER
+) -> Samples:
+    """The reference strategy: LS_obj and LS_noobj path traced in full, with the same random numbers.
+
+    From the vertex number ``roulette`` on paths end by chance: cheaper, noisier, as unbiased.
+    """
     import drjit as dr
 
     mi = worlds.mi
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": roulette})
     sampler = make_sampler(mi, samples)
     count = sampler.sample_count()
 
