@@ -73,7 +73,7 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) evaluate sample_captures/desk --out build/figures/desk_preview --with-truth probe,pose,camera,albedo
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
-HARD := counter courtyard lacquer
+HARD := counter courtyard lacquer cellar corner
 figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the other bundled captures (minutes)
 	@for c in $(HARD); do for q in preview draft; do \
 		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; \

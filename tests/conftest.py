@@ -51,6 +51,18 @@ def lacquer_build(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def cellar_build(tmp_path_factory) -> Path:
+    """Build folder of ``insitu run sample_captures/cellar --quality draft``; read it, never write into it."""
+    return draft_of("cellar", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def corner_build(tmp_path_factory) -> Path:
+    """Build folder of ``insitu run sample_captures/corner --quality draft``; read it, never write into it."""
+    return draft_of("corner", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
 def desk_shuffled(tmp_path_factory) -> tuple[Path, dict[str, str]]:
     """The photographs of desk in one folder under names that tell nothing; and the names they had."""
     folder = tmp_path_factory.mktemp("card")

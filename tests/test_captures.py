@@ -24,6 +24,7 @@ from stages import composite, ingest, knobs, render
 from stages.order import NAMES, graph
 
 CAPTURES = sorted(path.parent for path in SAMPLES.glob("*/capture.toml"))
+SLOW = {"cellar", "corner"}  # each a build of its own that no quick test shares
 DATA = Path(os.environ.get("INSITU_DATA", ROOT / "../shared/data")).resolve()
 KITCHEN = ROOT / "tests/kitchen_table"
 TIMED = {"report", "metrics"}  # these show seconds, so their bytes differ from run to run
@@ -73,7 +74,9 @@ def value(out: Path, artifact: Artifact) -> Any:
     return formats.read(out / graph().producer[artifact.name].name, artifact)
 
 
-@pytest.mark.parametrize("capture", CAPTURES, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "capture", [pytest.param(path, id=path.name, marks=[pytest.mark.slow] * (path.name in SLOW)) for path in CAPTURES]
+)
 def test_draft_meets_its_bounds(capture, request):
     check_bounds(capture, request.getfixturevalue(f"{capture.name}_build"), "draft")
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command import SAMPLES
 
 from pipeline.image.truth import load_truth
+from pipeline.light import near_field
 from pipeline.run import artifacts as A
 from pipeline.run import formats, settings, substitution
 from pipeline.run.runner import Build
+from pipeline.transport import local_light
 from pipeline.types import Raster, Surface
 from stages.knobs import KNOBS
 from stages.order import graph
@@ -126,3 +131,80 @@ def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
     after = forced(lacquer_build, "plane", lambda values: values["plane"], monkeypatch)
     assert after["object_rel_err"] > 1.3 * before["object_rel_err"]
     assert after["shadow_change_err"] > 2 * before["shadow_change_err"]
+
+
+# ---------------------------------------------------------------- cellar: lamps nearby, a shaking hand, labels that lie
+
+
+@pytest.mark.slow
+def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_cost(cellar_build, monkeypatch):
+    """Forced off: the map as the ball saw it, 0.3 m away. Predicted: 37 % of the irradiance, 6 % left.
+
+    Measured: error of the shadows' change 0.062 -> 0.310, on the objects 0.046 -> 0.154: the figure is of the axis that
+    suffers most, which the ground faces and few of their pixels.
+    """
+    found = numbers(cellar_build, "probe")
+    assert found["near_irradiance_error"] > 5 * KNOBS["probe"]().near_budget
+    assert found["near_irradiance_error_left"] < 0.75 * found["near_irradiance_error"]
+
+    def unmoved(values: dict[str, Any]) -> Raster:
+        light = values["environment"]
+        rgb = near_field.at_probe(light.rgb(), light.attributes, near_field.room_of(values["facts"]))
+        return Raster({**light.channels, **Raster.split(rgb.astype(np.float32))}, light.space, light.attributes)
+
+    before = json.loads((cellar_build / "evaluate/metrics.json").read_text())
+    after = forced(cellar_build, "environment", unmoved, monkeypatch)
+    assert after["shadow_change_err"] - before["shadow_change_err"] > found["near_irradiance_error"] / 2
+    assert after["object_rel_err"] > 2 * before["object_rel_err"]
+
+
+@pytest.mark.slow
+def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
+    """The shift is the stated turn's; every exposure is that of the shutter, not of the label, but for a common factor.
+
+    Measured: 3.25 px of 3.18, exposures within 0.4 % where labels are 40 and 20 % off.
+    """
+    camera = formats.read(cellar_build / "calibrate", A.CAMERA)
+    merged = json.loads((cellar_build / "merge/record.json").read_text())
+    aligned = next(row for row in merged["evidence"] if row["term"] == "alignment of frames")
+    assert aligned["modelled"]
+    turned = camera.fx * np.tan(np.radians(0.30))
+    assert merged["numbers"]["shift_px"] == pytest.approx(turned, abs=0.2)
+    truth = json.loads((SAMPLES / "cellar/truth/truth.json").read_text())["exposures"]
+    rows = [row for view in formats.read(cellar_build / "merge", A.EXPOSURES).values() for row in view]
+    off = np.array([np.log(row["estimated_s"] / truth[row["file"]]["true_s"]) for row in rows])
+    lies = np.array([np.log(row["label_s"] / truth[row["file"]]["true_s"]) for row in rows])
+    assert np.ptp(lies) > np.log(1.4 / 0.8) - 0.1
+    assert np.abs(off - np.median(off)).max() < 0.01
+
+
+# ---------------------------------------------------------------- corner: bright surfaces that light each other
+
+
+@pytest.mark.slow
+def test_bounce_in_the_corner_is_taken_off_because_of_what_it_would_cost(corner_build, monkeypatch):
+    """Forced off: what the walls throw on the table is taken for albedo. Predicted: 7.6 % too bright (median).
+
+    Measured: error of the albedo 0.031 -> 0.093, of the shadows' change 0.067 -> 0.157; the objects keep theirs, 0.03.
+    """
+    found = numbers(corner_build, "reflectance")
+    bounce = local_light.local_light
+
+    def without(*given: Any) -> local_light.LocalLight:
+        near = bounce(*given)
+        return replace(near, irradiance=near.irradiance - near.bounced)
+
+    monkeypatch.setattr(local_light, "local_light", without)
+    before = json.loads((corner_build / "evaluate/metrics.json").read_text())
+    after = forced(corner_build, "plane", lambda values: values["plane"], monkeypatch)
+    assert after["albedo_rel_err"] - before["albedo_rel_err"] > found["bounce_ignored_rel"] / 2
+
+
+@pytest.mark.slow
+def test_walls_of_the_corner_have_their_colour(corner_build):
+    """Albedo of both proxies, which capture.toml does not say, against the scene file; measured 1.7 and 1.2 % off."""
+    scene = tomllib.loads((SAMPLES / "scenes/corner.toml").read_text())
+    true = {box["name"]: np.array(box["albedo"]) for box in scene["box"]}
+    for proxy in formats.read(corner_build / "reflectance", A.LOCAL_PROXIES):
+        error = np.linalg.norm(proxy.albedo - true[proxy.name]) / np.linalg.norm(true[proxy.name])
+        assert error < 0.03, proxy.name
