@@ -67,33 +67,33 @@ def compute(
     """Metrics (empty without truth), self-check, and the error map (1x1 without truth)."""
     photographs = balanced(photographs, balance)
     plate = photographs["plate"].rgb()
-    checks = self_check(facts, photographs, camera, views, balls, environment, plane, albedo)
     same, fraction = metrics.untouched(composite.rgb(), plate, layers["influence"], layers["obj.A"])
+    numbers = {"untouched_identical": same, "untouched_fraction": fraction}
+    found: dict[str, Any] = {}
+    error_map = Raster({"class": np.zeros((1, 1), np.uint32)}, ERROR_MAP.space)
+    with ThreadPoolExecutor(1) as pool:  # beside the figures: FLIP leaves Python to others
+        checking = pool.submit(self_check, facts, photographs, camera, views, balls, environment, plane, albedo)
+        if facts.get("truth_path"):
+            truth = load_truth(Path(facts["truth_path"]))
+            light = near_field.at_probe(environment.rgb(), environment.attributes, near_field.room_of(facts))
+            found, ref, error_map = score(composite.rgb(), plate, truth, params.pixels_per_degree)
+            free = (layers["influence"] == 0) & (layers["obj.A"] == 0)
+            found |= numbers | {
+                "shadow_outside_region": _share(free, ref.shadow),
+                "faint_outside_region": _share(free, ref.faint),
+                **pose_errors(truth, camera, views, balls),
+                **probe_errors(truth, light, found["scale"]),
+                **albedo_errors(truth, camera, views["plate"], plane, albedo),
+                "seconds": {stage: record["seconds"] for stage, record in records.items()},
+            }
+            numbers = {key: value for key, value in found.items() if not isinstance(value, dict)}
+        checks = checking.result()
     warnings = exposure_warnings(checks)
     warnings += [] if same else ["pixels outside the region of influence differ from the plate; report this"]
-    if not facts.get("truth_path"):
-        nothing = Raster({"class": np.zeros((1, 1), np.uint32)}, ERROR_MAP.space)
-        outputs = {"metrics": {}, "selfcheck": checks, "error_map": nothing}
-        return Result(outputs, {"untouched_identical": same, "untouched_fraction": fraction}, warnings)
-    truth = load_truth(Path(facts["truth_path"]))
-    light = near_field.at_probe(environment.rgb(), environment.attributes, near_field.room_of(facts))
-    found, ref, error_map = score(composite.rgb(), plate, truth, params.pixels_per_degree)
-    free = (layers["influence"] == 0) & (layers["obj.A"] == 0)
-    found |= {
-        "untouched_identical": same,
-        "untouched_fraction": fraction,
-        "shadow_outside_region": _share(free, ref.shadow),
-        "faint_outside_region": _share(free, ref.faint),
-        **pose_errors(truth, camera, views, balls),
-        **probe_errors(truth, light, found["scale"]),
-        **albedo_errors(truth, camera, views["plate"], plane, albedo),
-        "seconds": {stage: record["seconds"] for stage, record in records.items()},
-    }
-    if found["non_finite"]:
+    if found.get("non_finite"):
         warnings.append(
             f"the composite holds {found['non_finite']} values that are not finite; they are scored as black"
         )
-    numbers = {key: value for key, value in found.items() if not isinstance(value, dict)}
     return Result({"metrics": found, "selfcheck": checks, "error_map": error_map}, numbers, warnings)
 
 

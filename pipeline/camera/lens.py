@@ -63,8 +63,10 @@ def unproject(camera: Camera, px: np.ndarray) -> np.ndarray:
 def pixel_rays(camera: Camera, px: np.ndarray) -> np.ndarray:
     """Unit directions (N, 3), camera frame, of pixels (N, 2), through the full inverse of the lens."""
     xy = unproject(camera, px)
-    directions = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1)
-    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    rays = np.ones((*xy.shape[:-1], 3))
+    rays[..., :2] = xy
+    rays /= np.sqrt(1 + xy[..., 0] ** 2 + xy[..., 1] ** 2)[..., None]
+    return rays
 
 
 def rays_through(camera: Camera, px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ def pattern(px: list[np.ndarray], residuals: list[np.ndarray], width: int, heigh
     freedom = sum(2 * (len(found) - 1) for found in used)
     if not used or freedom < 1:
         return Pattern(0.0, 0.0, 1.0, 0)
-    from scipy.stats import f
+    from scipy.special import fdtrc
 
     variance = max(sum(float(((one - one.mean(0)) ** 2).sum()) for one in used) / freedom, 1e-12)
     counts = np.array([len(found) for found in used])
@@ -47,5 +47,5 @@ def pattern(px: list[np.ndarray], residuals: list[np.ndarray], width: int, heigh
     excess = squares - 2 * variance / counts
     return Pattern(
         float(np.sqrt(max(excess.mean(), 0.0))), float(np.sqrt(max(excess.max(), 0.0))),
-        float(f.sf(ratio, 2 * len(used), freedom)), len(used),
+        float(fdtrc(2 * len(used), freedom, ratio)), len(used),
     )  # fmt: skip

@@ -160,11 +160,12 @@ def _with_ghosts(sight: Sight, px: np.ndarray, found: np.ndarray, mirrored: np.n
         ratio = mirrored / found[:, :3].reshape(-1, rays, 3).mean(1)
     usable = np.isfinite(ratio).all(1)
     facing = np.clip(np.median(ratio[usable], 0), 0.05, 1) if usable.any() else np.ones(3)
-    sine = np.minimum(np.nan_to_num(ball_points(sight, px)[1]), 1)
+    rays_px = pixel_rays(sight.camera, px)
+    sine = np.minimum(np.nan_to_num(ball_points(sight, px, rays_px)[1]), 1)
     mixed = found.copy()
     for order, share in zip((0, 2), sight.glass.ghosts(facing, sine), strict=True):
         ghost = replace(sight, glass=replace(sight.glass, order=order))
-        there = ball_points(ghost, px)[3]
+        there = ball_points(ghost, px, rays_px)[3]
         values, seen = _direct(
             sight.picture, sight.camera, sight.world_from_camera, sight.centre, sight.radius, np.nan_to_num(there)
         )
@@ -173,21 +174,24 @@ def _with_ghosts(sight: Sight, px: np.ndarray, found: np.ndarray, mirrored: np.n
     return mixed
 
 
-def ball_points(sight: Sight, px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def ball_points(
+    sight: Sight, px: np.ndarray, rays: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of pixels (N, 2), in the world: outward normal of the ball (N, 3), sine of the incidence (N,), reflected unit
     direction (N, 3), and point of y = 0 that it meets (N, 3).
 
     NaN where the ball is not hit; the point also where the direction does not go down. Of a glass ball the normal is
-    that where the ray enters.
+    that where the ray enters. ``rays`` (N, 3): those of the pixels, when they are at hand: most of the work.
     """
     centre, radius, world_from_camera = sight.centre, sight.radius, sight.world_from_camera
-    rays = pixel_rays(sight.camera, px)
+    rays = pixel_rays(sight.camera, px) if rays is None else rays
     along = rays @ centre
     inside = along**2 - centre @ centre + radius**2
     hit = (along - np.sqrt(np.where(inside >= 0, inside, np.nan)))[:, None] * rays
     normal = (hit - centre) / radius
-    away = rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
-    sine = np.linalg.norm(np.cross(rays, normal), axis=-1)
+    away = rays - 2 * np.einsum("ni,ni->n", rays, normal)[:, None] * normal
+    (a, b, c), (u, v, w) = rays.T, normal.T
+    sine = np.sqrt((b * w - c * v) ** 2 + (c * u - a * w) ** 2 + (a * v - b * u) ** 2)
     if sight.glass is not None:
         outward, away = leaving(sight.glass, rays, normal)
         hit = centre + radius * outward
@@ -234,9 +238,11 @@ def _direct(
     px = project(camera, local)
     distance = float(np.linalg.norm(centre))
     with np.errstate(invalid="ignore"):
-        away = np.arccos(np.clip(local @ (centre / distance) / np.linalg.norm(local, axis=-1), -1, 1))
+        length = np.sqrt(np.einsum("ni,ni->n", local, local))
+        away = np.arccos(np.clip(local @ (centre / distance) / length, -1, 1))
         beside = np.arcsin(radius / distance) + BESIDE_PX / min(camera.fx, camera.fy)
-        seen = (px > 1).all(-1) & (px < np.array([camera.width, camera.height]) - 1).all(-1) & (away > beside)
+        (x, y), right, bottom = px.T, camera.width - 1, camera.height - 1
+        seen = (x > 1) & (y > 1) & (x < right) & (y < bottom) & (away > beside)
     shape = (-(-len(px) // LOOKUP_ROW), LOOKUP_ROW)  # OpenCV takes at most 32767 positions in one row
     x, y = (np.resize(np.where(seen, px[:, i], 1), shape) for i in (0, 1))
     return bilinear(planes(picture), x, y).reshape(-1, picture.shape[2])[: len(px)].astype(float), seen

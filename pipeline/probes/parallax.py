@@ -61,7 +61,7 @@ def _reach(
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.sqrt(np.einsum("...i,...i", vectors, vectors))[..., None]
 
 
 def set_down(

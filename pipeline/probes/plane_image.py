@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.camera.lens import project
+from pipeline.camera.lens import pixel_rays, project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes.ball_pairs import Sight, ball_points, neighbourhood, plane_pairs
 from pipeline.probes.glass import Glass
@@ -138,11 +138,11 @@ def equations_of(
     if use.sum() < LEAST_PIXELS:
         return None
     used = grid(use)
-    broad = _smoothed(used, np.ones(shape), max(BROAD_PX, 3 * smooth))
+    far = max(BROAD_PX, 3 * smooth)
+    broad = np.maximum(_blurred(used, far), 1e-6)
 
     def sharp(values: np.ndarray) -> np.ndarray:
-        spread = _smoothed(values * used, np.ones(shape), max(BROAD_PX, 3 * smooth))
-        return np.asarray((values - spread / np.maximum(broad, 1e-6))[at][use])
+        return np.asarray((values - _blurred(values * used, far) / broad)[at][use])
 
     moved = -np.einsum("ni,nij->nj", slope[at], np.nan_to_num(shift))
     columns = [sharp(grid(moved[:, k])) * pixel for k in range(3)] + [sharp(bend)]
@@ -159,10 +159,14 @@ def equations_of(
 
 def _smoothed(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian mean (H, W) of the known values, zero where nothing is."""
+    return _blurred(values * known, sigma) / np.maximum(_blurred(known, sigma), 1e-6) * known
+
+
+def _blurred(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian mean (H, W), zero outside."""
     from scipy.ndimage import gaussian_filter
 
-    share = gaussian_filter(known, sigma, truncate=3, mode="constant")
-    return gaussian_filter(values * known, sigma, truncate=3, mode="constant") / np.maximum(share, 1e-6) * known
+    return np.asarray(gaussian_filter(values, sigma, truncate=3, mode="constant"))
 
 
 def _shrunk(inside: np.ndarray, pixels: int) -> np.ndarray:
@@ -193,9 +197,10 @@ def _shifts(sight: Sight, px: np.ndarray, with_glass: bool = False) -> np.ndarra
     The point of the plane is held, and what it is known by is the pixel ``P`` where it is seen directly:
     ``dx = -(dP/dx)^-1 dP/dq``, by central differences.
     """
+    rays = pixel_rays(sight.camera, px)
 
     def direct(place: np.ndarray, changed: Sight) -> np.ndarray:
-        point = ball_points(changed, place)[3]
+        point = ball_points(changed, place, rays if place is px else None)[3]
         return project(changed.camera, transform_points(invert_rigid(changed.world_from_camera), point))
 
     def change(plus: np.ndarray, minus: np.ndarray, step: float) -> np.ndarray:
