@@ -77,7 +77,7 @@ HARD := counter courtyard lacquer cellar corner
 figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the other bundled captures (minutes)
 	@for c in $(HARD); do for q in preview draft; do \
 		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; \
-		$(INSITU) evaluate sample_captures/$$c --out build/figures/$${c}_preview --with-truth probe,pose,camera,albedo; done
+		$(INSITU) evaluate sample_captures/$$c --out build/figures/$${c}_draft --with-truth probe,pose,camera,albedo; done
 	@$(INSITU) figures $(foreach c,$(HARD),$(foreach q,preview draft,build/figures/$(c)_$(q))) > docs/figures_hard.md
 
 extremes: $(READY)  ## run every case of tests/extremes/cases.toml, into docs/numerics.md, numerics.json and formulas.json
