@@ -2,8 +2,9 @@
 
 The map's stated variance is a texel's. Three things tie texels together. What all share (exposure between plate and
 probe, reflectance of the ball) is stated in the map's header. What one flux was recovered for, its texels share. The
-rest is the probe's picture: how its pixels sample a small lamp, each colour of a mosaic by itself, errs for all texels
-within a few pixels together. So those count as alike within cells, and as independent beyond.
+rest is the probe's picture: where it is displaced, all texels within a few pixels err together, so those count as alike
+within cells, and as independent beyond. How its pixels sample a small lamp, each colour of a mosaic by itself, no texel
+knows: that error is the lamp's, by the pixels that it covers.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from pipeline.light.environment import SCALE_SIGMA
 from pipeline.types import Raster
 
 ALIKE = "insitu:alike_deg"  # in a map's header: width of the cells within which texels err alike
-# Pixels of the probe's picture: demosaicking takes in two to each side. Lamps of 1 to 4 degrees, seen in balls of 40 to
-# 240 px through a mosaic, are off by 0.4 to 1.1 times what is stated with it (rms; tests/test_alike.py), lamps of fewer
-# than ten pixels by more.
-ALIKE_PX = 3.0
+ALIKE_PX = 3.0  # pixels of the probe's picture: demosaicking takes in two to each side
 ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
+# Relative error of a lamp's light (R, G, B) times the pixels that it covers, each colour sampled by a mosaic by itself.
+# Lamps of ten pixels and more, of 1 to 4 degrees in balls of 40 to 240 px, are off by 0.5 to 1.3 times the sigma that
+# this gives (rms, bilinear and Malvar; tests/test_alike.py); smaller ones by more where demosaicking is bilinear.
+SAMPLED = np.array([2.0, 1.0, 2.0])
 
 
 def alike_rows(environment: Raster) -> int:
@@ -58,6 +60,20 @@ def cell_sums(values: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate(sums)
 
 
+def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
+    """Relative sigma (3,) of the sum of ``light`` (H, W, 3) by the pixels that it covers; zero where no map says so.
+
+    Covered is ``(sum L)^2 / sum L^2`` over solid angle. It is at most 1.
+    """
+    if ALIKE not in environment.attributes:
+        return np.zeros(3)
+    pixel = np.radians(float(environment.attributes[ALIKE]) / ALIKE_PX) ** 2
+    solid = latlong_solid_angles(*environment.shape)[..., None]
+    squares = (np.square(light) / solid).sum((0, 1))
+    covered = np.divide(light.sum((0, 1)) ** 2, squares, out=np.full(3, np.inf), where=squares > 0)
+    return np.asarray(np.minimum(SAMPLED / np.maximum(covered / pixel, 1), 1))
+
+
 def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Sigma (3,) of the irradiance that texels (N,), flat indices, give a surface that faces ``direction`` (3,).
 
@@ -71,7 +87,13 @@ def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -
     shared, told = shared_sigma_of(environment), environment.channels.get("recovered", np.zeros((height, width))) > 0
     one = weight * own_sigma(environment, np.zeros(3)) * told[..., None]
     own = weight * own_sigma(environment, shared) * ~told[..., None]
-    all_of_it = shared * (weight * environment.rgb() * ~told[..., None]).sum((0, 1))
+    measured = weight * environment.rgb() * ~told[..., None]
+    all_of_it = shared * measured.sum((0, 1))
     known = "variance.R" in environment.channels
-    total = one.sum((0, 1)) ** 2 + (cell_sums(own, alike_rows(environment)) ** 2).sum(0) + known * all_of_it**2
+    sampled = sampling_sigma(environment, measured) * measured.sum((0, 1))
+    total = (
+        one.sum((0, 1)) ** 2
+        + (cell_sums(own, alike_rows(environment)) ** 2).sum(0)
+        + known * (all_of_it**2 + sampled**2)
+    )
     return np.asarray(np.sqrt(total))
