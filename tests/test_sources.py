@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command import SAMPLES, command
 from printed_board import MARKER, looking_at, marker_print, photograph
 
 from pipeline.camera.contact import contact_covariance
 from pipeline.camera.lens import project
 from pipeline.camera.rigid import camera_points
 from pipeline.camera.sources import KnownLens, left_at
+from pipeline.run import artifacts as A
+from pipeline.run import formats
 from pipeline.run.errors import ManifestError
 from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Sources, View
 from stages import calibrate, knobs, pose, sfm, sources
@@ -164,3 +169,57 @@ def test_a_cloud_that_no_marker_places_leaves_the_pose_to_the_plates_marker(plat
     result = pose.compute(FACTS, {"plate": raster(picture)}, TRUTH, {}, cloud, [], knobs.Pose())
     assert result.outputs["views"]["plate"].route == "marker"
     assert result.warnings[0].startswith("pose: further views cannot orient plate (sfm: the first marker is seen in 1")
+
+
+SEEN = """
+name = "seen"
+root = "{root}"
+[plate]
+files = ["views/view_04.jpg"]
+[[ball]]
+name = "hand"
+files = ["views/view_02.jpg"]
+[[exposure]]
+files = ["views/view_04.jpg", "views/view_02.jpg"]
+exposure_s = 0.1
+iso = 100
+fnumber = 8
+[probe]
+kind = "mirror_ball"
+diameter_m = 0.07
+[[marker]]
+dictionary = "DICT_5X5_100"
+id = 7
+side_m = 0.06
+[[marker]]
+dictionary = "DICT_5X5_100"
+id = 23
+side_m = 0.06
+[views]
+files = ["views/view_01.jpg", "views/view_03.jpg", "views/view_05.jpg", "views/view_06.jpg", "views/view_07.jpg"]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lens", ["stated", "of EXIF and the boards in view"])
+def test_counter_seen_with_its_markers_needs_no_cloud(lens: str, tmp_path: Path) -> None:
+    """The plate shows both markers, and there are five further views: COLMAP does not run, and the foot is right."""
+    truth = json.loads((SAMPLES / "counter/truth/truth.json").read_text())
+    true = Camera(**{key: truth["camera"][key] for key in (*GIVEN, "distortion")})
+    stated = "".join(f"{key} = {getattr(true, key)}\n" for key in GIVEN) + f"distortion = {true.distortion.tolist()}\n"
+    text = SEEN.format(root=SAMPLES / "counter") + (f"[camera.given]\n{stated}" if lens == "stated" else "")
+    (tmp_path / "capture.toml").write_text(text)
+    done = command("run", tmp_path, "--out", tmp_path / "build", "--upto", "pose")
+    assert done.returncode == 0, done.stderr
+    numbers = json.loads((tmp_path / "build/sources/record.json").read_text())["numbers"]
+    assert (numbers["cloud"], numbers["lens"], numbers["route"]) == (False, lens, "marker")
+    assert numbers["contact_px"]["marker"] < 0.5
+    assert json.loads((tmp_path / "build/sfm/record.json").read_text())["numbers"] == {"photos": 0}
+    view = formats.read(tmp_path / "build/pose", A.VIEWS)["plate"]
+    camera = formats.read(tmp_path / "build/calibrate", A.CAMERA)
+    at = np.array(truth["views"]["view_04"]["world_from_camera"])
+    for foot in (np.zeros(3), np.array([0.165, 0, 0.02])):
+        ends = [(camera, view.world_from_camera), (true, at)]
+        off = np.subtract(*(project(one, camera_points(pose, foot[None])[0])[0] for one, pose in ends))
+        assert np.linalg.norm(off) < 0.5
+        assert off @ np.linalg.solve(contact_covariance(camera, view, foot), off) < CHI2_2
