@@ -12,6 +12,7 @@ import pytest
 from benchmarks import flux_scene
 from pipeline.conventions import CLIPPED, invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light import ball_shadow
+from pipeline.light.environment import irradiance
 from pipeline.light.flux import Card, Shadow, predicted, solve
 from pipeline.probes import clipped
 from pipeline.probes.cards import Cards
@@ -233,6 +234,35 @@ def test_lit_patches_alone_are_not_evidence():
     assert np.all(found.condition > 1e6)
     assert found.value.sum(0) == pytest.approx(np.full(3, 4.0), rel=1e-6)
     assert np.all(found.value >= 0.1)
+
+
+def test_one_card_does_not_tell_two_lamps_and_two_cards_do(scene):
+    """Degenerate by evidence: one equation for two fluxes names both; a second normal makes it two equations."""
+    fluxes = [5 * COLOUR, 4 * COLOUR]
+    rgb, over = flux_scene.true_map(scene, [*fluxes, *np.zeros((2, 3))], CLIP)
+    sky, _ = flux_scene.true_map(scene, list(np.zeros((4, 3))), CLIP)
+    below = latlong_directions(*over.shape)[..., 1:2] < 0
+    normals = np.array([[0, 1.0, 0], 0.4 * scene.lamps[0].direction + [0, 0.7, 0]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    facing = np.maximum(normals @ np.stack([lamp.direction for lamp in scene.lamps[:2]], 1), 0)
+    assert facing.min() > 0.1
+    light = irradiance(np.where(below, rgb, sky), normals) + facing @ np.stack(fluxes)
+
+    def told(cards: int) -> tuple[list, clipped.Recovered]:
+        seen = Cards(light[:cards], 0.005 * light[:cards], normals[:cards])
+        found = clipped.recover(rgb, (0.01 * rgb) ** 2, over, clipped.Witness(cards=seen))
+        return found.numbers["clipped_lights"], found
+
+    rows, found = told(1)
+    assert [row["lower_bound"] for row in rows] == [True, True]
+    assert all("cannot be told from another lamp's" in row["why_not"] for row in rows)
+    assert np.array_equal(found.rgb, rgb)
+    rows, _ = told(2)
+    for row in rows:
+        assert not row["lower_bound"], row["why_not"]
+        near = min(range(2), key=lambda k: abs(row["elevation_deg"] - DIRECTIONS[k][0]))
+        error = np.abs(np.array(row["flux"]) - fluxes[near])
+        assert np.all(error < 3 * np.array(row["flux_sigma"]))
 
 
 def test_lamps_with_the_same_response_are_named():
