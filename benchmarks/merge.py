@@ -108,7 +108,7 @@ def ratios(folder: Path) -> dict[str, Any]:
 
 def floor_kernel() -> Callable[..., None]:
     """Reads five uint16 planes, writes two of float32 and one of uint8; compiled as the merge is."""
-    from pipeline.image.merge_kernel import compiled
+    from pipeline.image.machine_code import compiled
 
     return compiled(_move)
 

@@ -59,7 +59,7 @@ BRIDGES = {
         "pipeline/simulation/twin_world.py",
     },
     "pycolmap": {"pipeline/camera/colmap_bridge.py"},
-    "numba": {"pipeline/image/merge_kernel.py"},
+    "numba": {"pipeline/image/machine_code.py"},
     "rawpy": {"pipeline/image/libraw.py"},
     "tifffile": {"pipeline/image/encoded.py", "pipeline/image/tags.py"},
     "imagecodecs": {"pipeline/image/dng_data.py", "pipeline/image/encoded.py", "pipeline/simulation/dng.py"},

@@ -274,10 +274,10 @@ def test_machine_code_is_the_source():
     """The compiled kernel and the same lines run by Python give the same bytes."""
     from pipeline.image import merge_kernel
 
-    frames = bracket(np.geomspace(2e-4, 300, 3 * 700).reshape(3, 700))
+    frames = bracket(np.geomspace(2e-4, 300, 3 * 1301).reshape(3, 1301))  # chunks within the row, and beyond its end
     compiled = merge(frames)
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):
-        patch.setattr(merge_kernel, "block_kernel", lambda: merge_kernel.merge_block)
+        patch.setattr(merge_kernel, "rows_kernel", lambda: merge_kernel.merge_rows)
         plain = merge(frames)
     for name in ("radiance", "variance", "mask"):
         assert getattr(compiled, name).tobytes() == getattr(plain, name).tobytes()

@@ -30,11 +30,10 @@ from typing import Literal
 import numpy as np
 
 from pipeline.conventions import HOT
-from pipeline.image import merge_kernel
-from pipeline.image.merge_kernel import MARGIN
+from pipeline.image import machine_code, merge_kernel
 from pipeline.image.noise import Noise
 
-TILE_ROWS = 32  # even, so that a tile starts on a whole CFA cell; few enough to stay in cache, more than calls cost
+TILE_ROWS = 128  # even, so that a tile starts on a whole CFA cell; more than calls cost
 LIMIT_MARGIN = 0.002  # of full scale kept from the clip level: knee of the converter
 GHOST_SIGMA = 5.0  # of the chi-square, as a normal deviate: one false alarm in 3.5 million photosites
 LEAST_SHOT, LEAST_FLOOR = 1e-9, 1e-14  # of full scale: no data are better, and weights stay finite
@@ -124,22 +123,22 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
     ordered = sorted(frames, key=lambda frame: (frame.exposure, _digest(frame.mosaic) if tied else b""))
     shape = ordered[0].mosaic.shape
     result = Merged(*(np.empty(shape, dtype) for dtype in (np.float32, np.float32, np.uint8)))
-    pitch = 2 if len(shape) == 2 else shape[2]
-    coefficients, bounds = _coefficients(ordered), np.array([_clip_bounds(frame) for frame in ordered])
-    limits = _chi2_limits(len(ordered))
+    tables, limits = _coefficients(ordered), _chi2_limits(len(ordered))
     dtype = np.uint16 if all(frame.mosaic.dtype in (np.uint8, np.uint16) for frame in ordered) else np.float32
-    kernel, tiles = merge_kernel.block_kernel(), range(0, shape[0], TILE_ROWS)
+    kernel, tiles = merge_kernel.rows_kernel(), range(0, shape[0], TILE_ROWS)
+    lacking = merge_kernel.slots(len(ordered)) - len(ordered)
 
     def work(share: range) -> None:
-        samples = merge_kernel.padded_rows(len(ordered), TILE_ROWS, int(np.prod(shape[1:])), dtype)
+        memory = merge_kernel.working_memory(len(ordered), 2 if len(shape) == 2 else shape[2])
         for start in share:
             rows = slice(start, min(start + TILE_ROWS, shape[0]))
             out = [
                 part[rows].reshape(rows.stop - start, -1) for part in (result.radiance, result.variance, result.mask)
             ]
-            for target, frame in zip(samples, ordered):
-                _load(frame.mosaic[rows], target[: rows.stop - start, MARGIN : MARGIN + out[0].shape[1]])
-            kernel(samples, start, pitch, coefficients, bounds, weights == "poisson", limits, *out)
+            samples = [_rows(frame.mosaic[rows], dtype) for frame in ordered]
+            samples += samples[-1:] * lacking
+            room = (0,) * len(samples), _streams([*samples, *out]), memory, np.zeros(len(ordered), int)
+            kernel(tuple(samples), start, *tables, weights == "poisson", limits, *room, np.zeros(len(ordered)), *out)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(work, (tiles[number::workers] for number in range(workers))))
@@ -154,41 +153,51 @@ def _digest(mosaic: np.ndarray) -> bytes:
     return digest.digest()
 
 
-def _load(rows: np.ndarray, target: np.ndarray) -> None:
-    """Copy rows of DN to (h, S); infinite samples become NaN."""
-    target[:] = np.reshape(rows, target.shape)
-    if target.dtype.kind == "f":
-        target[~np.isfinite(target)] = np.nan
+def _rows(mosaic: np.ndarray, dtype: type) -> np.ndarray:
+    """(h, S) contiguous DN of some rows, copied only where they are not; infinite samples become NaN."""
+    rows: np.ndarray = np.ascontiguousarray(mosaic, dtype).reshape(len(mosaic), -1)
+    if dtype is np.float32 and not np.isfinite(rows).all():
+        return np.where(np.isfinite(rows), rows, np.float32(np.nan))
+    return rows if rows.flags.writeable else rows.copy()  # the compiler takes another type for another machine code
 
 
-def _coefficients(frames: Sequence[Exposed]) -> np.ndarray:
-    """(2, F, 11 * WINDOW) float32 of `merge_kernel.merge_block`, for even and for odd rows."""
-    rows = []
+def _streams(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """(N, 2) where arrays begin in memory and bytes per element."""
+    return np.array([(array.ctypes.data, array.itemsize) for array in arrays])
+
+
+def _coefficients(frames: Sequence[Exposed]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """``coefficients``, ``unclipped``, ``together`` and ``bounds`` of `merge_kernel.merge_rows`."""
+    single, bounds = [], []
     for frame in frames:
-        g, black, limit = frame.exposure, frame.black, frame.limit
+        g = frame.exposure
         shot, floor = np.maximum(frame.noise.shot, LEAST_SHOT), np.maximum(frame.noise.floor, LEAST_FLOOR)
-        bright = merge_kernel.BRIGHT_RATIO * floor / (shot * g)
-        dn = 1 / ((frame.white - black) * g)
-        cells = [black, dn, shot / g, floor / g**2, limit / g, g / shot, dn * g / shot]
-        rows.append([_along_rows(cell, frame.mosaic.shape) for cell in (*cells, bright)])
-    each = np.array(rows)  # (F, 8, 2, WINDOW)
-    total, floors = np.cumsum(each[:, 5], 0), np.cumsum(each[:, 5] ** 2 * each[:, 3], 0)
-    whole = np.concatenate([each, np.stack([total, 1 / total, floors], 1)], 1)
-    return np.ascontiguousarray(np.moveaxis(whole, 2, 0).reshape(2, len(frames), -1), np.float32)
+        dn = 1 / ((frame.white - frame.black) * g)
+        cells = [frame.black, dn, shot / g, floor / g**2, frame.limit / g, g / shot]
+        single.append(np.stack(np.broadcast_arrays(*cells), -1))
+        bounds.append(_bounds(frame, shot, floor))
+    each = np.stack([np.broadcast_to(cell, (2, *cell.shape[1:])) for cell in single], 2)  # (2, C, F, 6)
+    _, dn, shot, floor, limit, weight = np.moveaxis(each, -1, 0)
+    count, lacking = len(frames), merge_kernel.slots(len(frames)) - len(frames)
+    used = np.tri(count + 1, count, -1)  # (F + 1, F): of the first 0, 1, 2, ...
+    parts = [np.broadcast_to(part[..., None, :], (*part.shape[:2], *used.shape)) for part in (dn, shot, floor)]
+    alone = np.stack([used * (dn * weight)[..., None, :], *parts, np.broadcast_to(used, parts[0].shape)], -2)
+    alone = np.concatenate([alone, np.repeat(alone[..., -1:], lacking, -1)], -1)
+    alone[..., [0, 4], count:] = 0
+    total, floors = used @ weight[..., None], used @ (weight**2 * floor)[..., None]
+    beyond = np.concatenate([limit, np.full((*limit.shape[:2], 1), -np.inf)], -1)
+    least = np.concatenate([np.zeros((*limit.shape[:2], 1)), floor * weight], -1)
+    with np.errstate(divide="ignore"):
+        sums = np.stack([1 / total[..., 0], total[..., 0], floors[..., 0], beyond, least], -1)
+    return each.astype(np.float32), alone.astype(np.float32), sums.astype(np.float32), np.array(bounds)
 
 
-def _along_rows(cell: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """(2, WINDOW): a (2, 2) or (1, 3) cell along an even and an odd row, from MARGIN samples before a cell on."""
-    period = 2 if len(shape) == 2 else shape[2]
-    columns = (np.arange(merge_kernel.WINDOW) - MARGIN) % period
-    return np.broadcast_to(np.asarray(cell, float), (2, period))[:, columns]
-
-
-def _clip_bounds(frame: Exposed) -> tuple[float, float]:
-    """DN below which no sample of a frame clips, and from which on all do, a DN of rounding allowed for."""
-    level = frame.limit * (frame.white - frame.black) + frame.black
+def _bounds(frame: Exposed, shot: np.ndarray, floor: np.ndarray) -> tuple[float, float, float]:
+    """DN below which no sample clips, from which on all do, a DN of rounding allowed for, and all are bright."""
+    span = frame.white - frame.black
+    level, bright = frame.limit * span + frame.black, merge_kernel.BRIGHT_RATIO * floor / shot * span + frame.black
     margin = 1e-6 * float(np.abs(level).max())
-    return float(level.min()) - margin, float(level.max()) + margin
+    return float(level.min()) - margin, float(level.max()) + margin, float(np.max(bright))
 
 
 def _chi2_limits(frames: int) -> np.ndarray:
@@ -257,7 +266,7 @@ def _outliers(radiance: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, n
 @functools.cache
 def _outlier_kernel() -> Callable[..., None]:
     """`_mark_outliers`, compiled."""
-    return merge_kernel.compiled(_mark_outliers, _column_extremes)
+    return machine_code.compiled(_mark_outliers, _column_extremes)
 
 
 def _mark_outliers(radiance: np.ndarray, variance: np.ndarray, reach: float, beyond: np.ndarray) -> None:

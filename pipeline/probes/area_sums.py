@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from pipeline.image.merge_kernel import compiled
+from pipeline.image.machine_code import compiled
 from pipeline.light.sampling import summed_areas
 from pipeline.probes.mirror_geometry import BAND_PIXELS, BAND_TEXELS, WORKERS, Mirror, bands, pixel_solid_angles
 
