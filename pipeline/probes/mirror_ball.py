@@ -8,6 +8,7 @@ Limits: other light is taken as distant, so things at distance d are displaced b
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -137,12 +138,14 @@ def glass_of(shots: Shots, by_rim: dict[str, Found], radius: float, stated: Glas
     facts = shots.facts["probe"]
     if facts.get("diameter_m") is None:
         return judge(stated, {}, "at unknown size the mirrored plane tells the diameter")
-    measured = {
-        name: thickness(shots.photographs[name], shots.camera_of(name), shots.views[name], ball.fit, radius)
-        for name, ball in by_rim.items()
-        if ball.on_plane
-    }
-    known = {name: one for name, one in measured.items() if one is not None}
+
+    def measured(name: str) -> tuple[float, float, float] | None:
+        fit = by_rim[name].fit
+        return thickness(shots.photographs[name], shots.camera_of(name), shots.views[name], fit, radius)
+
+    names = [name for name, ball in by_rim.items() if ball.on_plane]
+    with ThreadPoolExecutor() as pool:  # arrays of all rays: most of it holds no lock
+        known = {name: one for name, one in zip(names, pool.map(measured, names), strict=True) if one is not None}
     return judge(stated, known, "too little texture of the plane is seen in the ball to tell", facts.get("material"))
 
 
