@@ -245,7 +245,7 @@ def sweep(
     return rows
 
 
-def small(balls: int = 20, radii: tuple[float, ...] = (30.0, 40.0, 60.0, 100.0)) -> list[dict[str, float]]:
+def small(balls: int = 20, radii: tuple[float, ...] = (30.0, 40.0, 60.0)) -> list[dict[str, float]]:
     """Rows by radius: errors of ``balls`` drawn balls with a plane, what is stated of them, and whether that is so.
 
     Keys: radius_px; direction_rms_deg, direction_median_deg, direction_p90_deg and above_1_deg (share) inside r < 0.9;
