@@ -252,13 +252,54 @@ def test_a_gap_is_bridged_by_the_next_frame():
 # a real bracket
 
 
+KNOTS = np.array([4.0, 8, 14, 22, 32, 45, 60, 80, 100, 125, 150, 175, 200, 225, 240])
+HATS = np.stack([np.interp(np.arange(256), KNOTS, row) for row in np.eye(len(KNOTS))], 1)
+CODES = np.arange(8, 231, 2)
+
+
+def code_pairs(one, other):
+    """How often each of `CODES` is seen in a picture (N,), and the sum of `HATS` (N, K) of what it is in the other."""
+    counts = np.bincount(one.ravel().astype(int) * 256 + other.ravel(), minlength=65536).reshape(256, 256)[CODES]
+    return counts.sum(1), counts @ HATS  # of F, not of codes: no bias by the curve's bend
+
+
+def even_steps(total, after):
+    """Steps (S,) in stops, their mean a third, of totals (S, N) and sums (S, N, K): see the test below."""
+    knots, count = len(KNOTS), len(total)
+    parts = []
+    for i in range(count):
+        seen = total[i] > 100
+        step = np.tile(-np.eye(count)[i], (seen.sum(), 1))
+        parts.append(np.hstack([HATS[CODES[seen]] - after[i][seen] / total[i][seen][:, None], step]))
+    mean = 1e3 * np.concatenate([np.zeros(knots), np.full(count, 1 / count)])
+    pinned = 1e3 * np.eye(knots + count)[0]
+    design = np.vstack([*parts, mean, pinned])
+    target = np.append(np.zeros(len(design) - 2), [1e3 / 3, 0])
+    weight = np.ones(len(target))
+    for _ in range(10):  # outliers: people, doors
+        solution = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
+        miss = np.abs(design @ solution - target)
+        weight = 1 / np.sqrt(1 + (miss / np.median(miss)) ** 2)
+    return solution[knots:]
+
+
+def excess(miss, sigma):
+    """Scatter beyond ``sigma`` that makes ``miss`` most likely, and the logarithm of that likelihood."""
+    scatter = np.geomspace(1e-4, 0.3, 400)
+    variance = sigma[:, None] ** 2 + scatter**2
+    likelihood = -0.5 * (miss[:, None] ** 2 / variance + np.log(variance)).sum(0)
+    return scatter[likelihood.argmax()], likelihood.max()
+
+
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason="no INSITU_DATA")
 def test_corridor_was_shot_in_thirds_whatever_exif_says():
     """Steps of 23 JPEGs without their times, and without the camera's curve.
 
     A code c in one frame becomes c' in the next: ``F(c) - F(c') = step`` with F the logarithm of the curve's inverse,
     one for all. F on knots and 22 steps are one linear least squares; F's power is free, so the steps' mean is set to
-    a third.
+    a third. Their uncertainty, the curve's freedom, rounding and hand-held motion in it, is the jackknife's over 16
+    parts of the picture. What shutter and daylight add from frame to frame nobody states: it is one number, as likely
+    as can be, for thirds and for EXIF's times each its own; then the two are compared.
     """
     from PIL import Image
 
@@ -268,29 +309,25 @@ def test_corridor_was_shot_in_thirds_whatever_exif_says():
     stated = -np.diff(np.log2(times))
     assert stated.min() < 0.22
     assert stated.max() > 0.41
-    knots = np.array([4.0, 8, 14, 22, 32, 45, 60, 80, 100, 125, 150, 175, 200, 225, 240])
-    hats = np.stack([np.interp(np.arange(256), knots, row) for row in np.eye(len(knots))], 1)
-    rows = []
-    for i, (one, other) in enumerate(pairwise(codes)):
-        counts = np.bincount(one.ravel().astype(int) * 256 + other.ravel(), minlength=65536).reshape(256, 256)
-        for code in range(8, 231, 2):
-            if (total := counts[code].sum()) > 100:
-                after = counts[code] @ hats / total  # of F, not of codes: no bias by the curve's bend
-                rows.append(np.concatenate([hats[code] - after, -np.eye(22)[i]]))
-    mean = 1e3 * np.concatenate([np.zeros(len(knots)), np.full(22, 1 / 22)])
-    pinned = 1e3 * np.eye(len(knots) + 22)[0]
-    design, target = np.array([*rows, mean, pinned]), np.append(np.zeros(len(rows)), [1e3 / 3, 0])
-    weight = np.ones(len(target))
-    for _ in range(10):  # outliers: people, doors
-        solution = np.linalg.lstsq(design * weight[:, None], target * weight, rcond=None)[0]
-        miss = np.abs(design @ solution - target)
-        weight = 1 / np.sqrt(1 + (miss / np.median(miss)) ** 2)
-    steps = solution[len(knots) :]
-    off = np.abs(steps - 1 / 3)
-    # Measured 0.317 to 0.370 (EXIF: 0.206 to 0.415). The bound was set after that and is not derived; the mean is 1/3
-    # because the curve's power is free, so what is shown is that the steps are even.
-    assert off.max() < 0.04
-    assert np.median(off) < 0.008
+    parts = [
+        [part for band in np.array_split(f, 4, 0) for part in np.array_split(band, 4, 1)] for f in codes
+    ]  # (F, 16)
+    pairs = [[code_pairs(a, b) for a, b in zip(one, other)] for one, other in pairwise(parts)]
+    total = np.array([[pair[0] for pair in row] for row in pairs])  # (S, 16, N)
+    after = np.array([[pair[1] for pair in row] for row in pairs])
+    steps = even_steps(total.sum(1), after.sum(1))
+    left_out = np.array(
+        [even_steps(total.sum(1) - total[:, k], after.sum(1) - after[:, k]) for k in range(total.shape[1])]
+    )
+    sigma = np.sqrt(15 / 16 * ((left_out - left_out.mean(0)) ** 2).sum(0))  # 0.001 to 0.02 of a stop
+    thirds, for_thirds = excess(steps - 1 / 3, sigma)
+    labelled, for_labels = excess(steps * 3 * stated.mean() - stated, sigma)
+    # A thousand to one was asked for before it was measured; it is exp(41), with 0.008 stops (0.6 %) of shutter and
+    # daylight for thirds and 0.063 for EXIF's times.
+    assert for_thirds - for_labels > np.log(1000)
+    assert thirds < labelled
+    # 22 normal deviates stay within 3.5 in 99 of 100 brackets. The largest is 2.5: steps of 0.317 to 0.370 are thirds.
+    assert np.abs((steps - 1 / 3) / np.hypot(sigma, thirds)).max() < 3.5
     assert np.abs(np.corrcoef(steps, stated)[0, 1]) < 0.5  # what EXIF makes of them is rounding
     named = [labels.time_meant(seconds, "thirds") for seconds in times]
     np.testing.assert_allclose(-np.diff(np.log2(named)), 1 / 3, atol=1e-9)  # and that is what the names mean
