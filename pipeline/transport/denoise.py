@@ -23,6 +23,7 @@ import numpy as np
 
 Pair = tuple[np.ndarray, np.ndarray]  # of the halves
 
+CLIPPED_SHARE = 1e-3  # of the ground's pixels, whose surviving light the denoiser may see cut off at zero
 MARGIN = 16  # px of surroundings given to the denoiser
 TILE = 8  # px, side of the tiles on which noise is told
 WINDOW = 16  # px, side of the window of the error estimates
@@ -269,15 +270,17 @@ class _Signals:
     cover: np.ndarray
     ground: np.ndarray
     level: np.float32
+    lift: np.float32  # what is added to surviving light so that the denoiser, which clips at zero, sees its noise whole
     albedo: np.ndarray
     normal: np.ndarray
 
     def drawn(self, survives: np.ndarray, obj: np.ndarray, fast: bool) -> tuple[np.ndarray, np.ndarray]:
         """Surviving light with the objects drawn over it, denoised in one picture and taken apart again."""
         shown, full = self.cover >= 0.5, np.maximum(self.cover, 1e-3)[..., None]
-        picture = np.where(shown[..., None], obj / (full * self.level), survives)
+        picture = np.where(shown[..., None], obj / (full * self.level), survives + self.lift)
         calm = oidn(picture, self.albedo, self.normal, fast)
-        return continued(calm, ~shown), continued(calm, shown) * self.level * self.cover[..., None]
+        left = np.maximum(continued(calm, ~shown) - self.lift, 0)
+        return left, continued(calm, shown) * self.level * self.cover[..., None]
 
 
 def _signals(
@@ -313,9 +316,23 @@ def _signals(
         cover=cover,
         ground=ground,
         level=np.float32(np.median(halves[0].without[bare]) if bare.any() else white),
+        lift=lifted(dim, ground),
         albedo=np.where(shown[..., None], obj_albedo / full, 1.0),
         normal=np.where(shown[..., None], obj_normal / full, 0.0),
     )
+
+
+def lifted(dim: Pair, ground: np.ndarray) -> np.float32:
+    """How far below zero surviving light goes by its noise in either half, but for `CLIPPED_SHARE` of the pixels.
+
+    Few samples of a glossy ground find more light lost than there is; a clipped mean would be too bright, and the
+    denoised picture worse than the raw one.
+    """
+    seen = ground > 0
+    if not seen.any():
+        return np.float32(0)
+    most = (np.quantile(brightest(half)[seen], 1 - CLIPPED_SHARE) for half in dim)
+    return np.float32(max(*most, 1.0) - 1)
 
 
 def quieted(
