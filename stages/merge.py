@@ -295,9 +295,16 @@ def _view_numbers(merged: Merged, hot: int, frames: int) -> dict[str, Any]:
         "ghost_fraction": _share(merged.mask, GHOST),
         "negative_fraction": np.count_nonzero(merged.radiance < 0) / merged.radiance.size,
         "hot_pixels": hot,
+        "hot_limit": _hot_limit(merged),
         "median_snr": float(np.median(snr)) if snr.size else 0.0,
         "range_stops": _stops(radiance[bright]),
     }
+
+
+def _hot_limit(merged: Merged) -> float | None:
+    """Share of the signal from which half of all hot photosites are found; None where none are looked for."""
+    limit = radiometry.defect_limit(merged) if merged.radiance.ndim == 2 else np.inf
+    return limit if np.isfinite(limit) else None
 
 
 def _share(mask: np.ndarray, bit: int) -> float:

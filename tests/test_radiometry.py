@@ -234,6 +234,26 @@ def test_hot_and_dead_photosites_are_replaced_and_a_small_light_is_not():
     assert merged.radiance[30, 30] > 1
 
 
+def test_half_of_the_hot_photosites_at_the_stated_limit_are_found():
+    """By its definition, in noise and in texture. 400 places know a share of a half to 2.5 %: 10 % is four sigma."""
+    random = np.random.default_rng(5)
+    y, x = np.mgrid[:420, :420]
+    for grain in (0.0, 0.1):
+        texture = np.exp(grain * random.standard_normal((210, 210))).repeat(2, 0).repeat(2, 1)
+        merged = merge(bracket(0.05 * texture * (1 + 0.2 * np.sin(x / 9) * np.cos(y / 7)), seed=3))
+        limit = radiometry.defect_limit(merged)
+        rows, columns = (part.ravel() for part in np.mgrid[10:410:20, 10:410:20])
+        rows, columns = rows + random.integers(0, 4, rows.size), columns + random.integers(0, 4, rows.size)
+        middle = radiometry._excess(merged.radiance, rows, columns)[1]
+        found = []
+        for share in (0.3 * limit, limit, 3 * limit):
+            hot = radiometry.Merged(merged.radiance.copy(), merged.variance, merged.mask.copy())
+            hot.radiance[rows, columns] += share * middle
+            found.append(np.mean(radiometry.replace_defects(hot)[0].mask[rows, columns] & HOT > 0))
+        assert found[1] == pytest.approx(0.5, abs=0.1)
+        assert found[0] < 0.1 < 0.9 < found[2]
+
+
 def test_clip_level_below_white_is_found_only_when_frames_share_it():
     radiance = np.geomspace(0.01, 40, 200 * 200).reshape(200, 200)
     frames = [np.minimum(frame.mosaic, 14000) for frame in bracket(radiance)]

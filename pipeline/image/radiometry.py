@@ -39,6 +39,9 @@ GHOST_SIGMA = 5.0  # of the chi-square, as a normal deviate: one false alarm in 
 LEAST_SHOT, LEAST_FLOOR = 1e-9, 1e-14  # of full scale: no data are better, and weights stay finite
 HOT_SIGMA = 8.0
 MAX_SUSPECTS = 0.005  # of the photosites are looked at as defects, the worst first; sensors have a tenth of it
+LIMIT_PLACES = (
+    20_000  # photosites that the limit of detection is the median of: known to half a percent of their spread
+)
 ISOLATION = 0.15  # a defect's neighbours of other colours show less than this of it; optics spread light wider
 NEIGHBOURS = [(dy, dx) for dy in (-2, 0, 2) for dx in (-2, 0, 2) if (dy, dx) != (0, 0)]  # same colour
 ADJACENT = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)]
@@ -219,27 +222,53 @@ def replace_defects(merged: Merged) -> tuple[Merged, int]:
 
     Also how many. A defect stands out of all eight same-colour neighbours by HOT_SIGMA, while the adjacent photosites
     of the other colours show nothing: light, however small its source, is spread over several photosites by lens and
-    filter. Weaker ones hide in texture: of those of `kitchen_table` the ones above 40 % of the signal are found.
+    filter. Weaker ones hide in texture: `defect_limit` says how weak.
     """
     radiance, variance = merged.radiance, merged.variance
     rows, columns = _outliers(radiance, variance)
-    keep = np.zeros(len(rows), bool)
     if not len(rows):
         return merged, 0
     excess, middle, spread = _excess(radiance, rows, columns)
-    worst = np.zeros(len(rows))
-    height, width = radiance.shape
-    for dy, dx in ADJACENT:
-        y, x = _mirror(rows + dy, height), _mirror(columns + dx, width)
-        beside = np.abs(_excess(radiance, y, x)[0]) - 3 * np.sqrt(variance[y, x])
-        worst = np.maximum(worst, np.where(np.isfinite(beside), beside, np.inf))
-    keep = worst < ISOLATION * np.abs(excess)
+    keep = _shown_beside(merged, rows, columns) < ISOLATION * np.abs(excess)
     rows, columns, middle, spread = rows[keep], columns[keep], middle[keep], spread[keep]
     radiance[rows, columns] = middle
     # 1.25^2 / 8: variance of the median of eight over theirs; the rest is how far a photosite lies from its neighbours
     variance[rows, columns] = spread * (1 + 1.25**2 / 8)
     merged.mask[rows, columns] = HOT
     return merged, len(rows)
+
+
+def defect_limit(merged: Merged) -> float:
+    """Excess, as a share of the signal, at which `replace_defects` finds a hot photosite in half of the places.
+
+    From what it asks for at up to `LIMIT_PLACES` evenly spread photosites of a mosaic that are seen and sound; the shot
+    noise of the excess itself is left out. NaN where there are none.
+    """
+    radiance, variance = merged.radiance, merged.variance
+    height, width = radiance.shape
+    step = max(1, radiance.size // LIMIT_PLACES)
+    rows, columns = np.divmod(np.arange(0, radiance.size, step), width)
+    rows, columns = (part[merged.mask[rows, columns] == 0] for part in (rows, columns))
+    if not len(rows) or min(radiance.shape) < 5:
+        return float("nan")
+    around = [radiance[_mirror(rows + dy, height), _mirror(columns + dx, width)] for dy, dx in NEIGHBOURS]
+    excess, middle, _ = _excess(radiance, rows, columns)
+    beyond = np.max(around, 0) + HOT_SIGMA * np.sqrt(variance[rows, columns]) - middle
+    needed = np.maximum(beyond, _shown_beside(merged, rows, columns) / ISOLATION)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(middle > 0, (needed - excess) / middle, np.inf)
+    return float(np.median(share))
+
+
+def _shown_beside(merged: Merged, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The largest excess that a photosite's neighbours of other colours show beyond three sigma; not below 0."""
+    height, width = merged.radiance.shape
+    worst = np.zeros(len(rows))
+    for dy, dx in ADJACENT:
+        y, x = _mirror(rows + dy, height), _mirror(columns + dx, width)
+        beside = np.abs(_excess(merged.radiance, y, x)[0]) - 3 * np.sqrt(merged.variance[y, x])
+        worst = np.maximum(worst, np.where(np.isfinite(beside), beside, np.inf))
+    return worst
 
 
 def _outliers(radiance: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
