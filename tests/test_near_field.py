@@ -149,6 +149,7 @@ def test_a_moved_map_is_found_again_at_the_probe(maps):
     moved = near_field.relocate([maps[0]], ROOM.depth, PROBE, OBJECT)[0]
     header = near_field.places(OBJECT, PROBE)
     assert axis_errors(near_field.at_probe(moved, header, ROOM), maps[0]).max() < 0.01
+    np.testing.assert_array_equal(near_field.from_probe(maps[0], header, ROOM), moved)
     assert near_field.at_probe(moved, header, None) is moved
     assert near_field.at_probe(maps[0], near_field.places(PROBE, PROBE), ROOM) is maps[0]
 

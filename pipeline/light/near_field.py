@@ -186,10 +186,19 @@ def places_of(wishes: dict[str, Any], height: float) -> list[np.ndarray]:
 
 def at_probe(rgb: np.ndarray, attributes: dict[str, Any], room: Room | None) -> np.ndarray:
     """A map (H, W, 3) as the probe saw it, from one that was brought elsewhere: see `places` for its ``attributes``."""
+    return _between(rgb, attributes, room, VALID, MEASURED)
+
+
+def from_probe(rgb: np.ndarray, attributes: dict[str, Any], room: Room | None) -> np.ndarray:
+    """A map (H, W, 3) of the probe's place, brought to where the map with these ``attributes`` holds."""
+    return _between(rgb, attributes, room, MEASURED, VALID)
+
+
+def _between(rgb: np.ndarray, attributes: dict[str, Any], room: Room | None, start: str, end: str) -> np.ndarray:
     if room is None or VALID not in attributes or MEASURED not in attributes:
         return rgb
-    valid, measured = (np.array([float(x) for x in attributes[key].split()]) for key in (VALID, MEASURED))
-    return relocate([rgb], room.depth, valid, measured)[0]
+    source, target = (np.array([float(x) for x in attributes[key].split()]) for key in (start, end))
+    return relocate([rgb], room.depth, source, target)[0]
 
 
 def places(valid: np.ndarray, measured: np.ndarray) -> dict[str, str]:

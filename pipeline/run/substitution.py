@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.conventions import ACESCG, latlong_directions, latlong_from_direction
 from pipeline.image.metrics import box, scale_of
 from pipeline.image.truth import Truth, load_truth
+from pipeline.light import near_field
 from pipeline.light.sampling import bilinear, planes
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build, settle
@@ -39,14 +40,16 @@ def true_views(values: Values, truth: Truth) -> dict[str, View]:
 
 
 def true_environment(values: Values, truth: Truth) -> Raster:
-    """The light at the ball, turned to the world and brought to the plate's unit."""
+    """The light at the ball, turned to the world, brought to the plate's unit and to where the build's map holds."""
     if truth.environment is None:
         raise ManifestError("--with-truth probe: truth.json names no environment")
     height, width = truth.environment.shape[:2]
     u, v = latlong_from_direction(latlong_directions(height, width) @ truth.world_from_map)
     wrapped = np.concatenate([truth.environment[:, -1:], truth.environment, truth.environment[:, :1]], 1)
     light = bilinear(planes(wrapped), u * width + 1, v * height)
-    return Raster(Raster.split(light * scale_of(box(values["photographs"]["plate"].rgb()), box(truth.plate))), ACESCG)
+    light = light * scale_of(box(values["photographs"]["plate"].rgb()), box(truth.plate))
+    attributes, room = values["environment"].attributes, near_field.room_of(values["facts"])
+    return Raster(Raster.split(near_field.from_probe(light, attributes, room)), ACESCG)
 
 
 def true_albedo(values: Values, truth: Truth, build: Build) -> Raster:
