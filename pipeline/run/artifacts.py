@@ -78,7 +78,7 @@ ENVIRONMENT = Artifact(
     "environment",
     "raster",
     "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1); relative "
-    "sigma that all texels share in the header",
+    "sigma that all texels share, and how far apart they err alike, in the header",
     RADIANCE_UNIT,
     ACESCG,
 )
