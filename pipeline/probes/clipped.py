@@ -3,8 +3,10 @@
 A clipped lamp is a connected set of texels with the glare around it; its measured light is a lower bound. Its flux is
 recovered where something in the photographs answers to it (`pipeline.light.flux`): the ball's own shadow on the plane,
 as the tripod's ball photograph over the plate, needs no albedo; a card of known albedo gives an equation of its own.
-Lit surfaces of unknown albedo say nothing, as albedo and flux are one product there. What is not told apart is named
-and stays a lower bound. Limits: light from afar; the plane diffuse enough that a shadow is its loss of irradiance; an
+Lit surfaces of unknown albedo say nothing, as albedo and flux are one product there; nor are lit and shaded faces of a
+box asked, which say as much as they share one albedo and the light at the box is known: of a sun that gives 6 times the
+sky on the lit face, hypot(albedo, light) * 7 / 6, so 6 % at 2 and 5 %, 13 % at 10 and 5 %, where a shadow gives 1.3 %
+and a card 5 %. What is not told apart is named and stays a lower bound. Limits: light from afar; the plane diffuse enough that a shadow is its loss of irradiance; an
 error of scale that the whole map has (the ball's reflectance) the fluxes share.
 """
 
