@@ -98,7 +98,7 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
         lobes.append(lobe * level * np.sqrt((errors**2).sum(0)) / np.maximum(energy, 1e-300))
         direct += (cell_sums(weight * cosine * sigma, rows) ** 2).sum(0)
     # Six numbers average what varies within a lobe: as much is given back as irradiance has of it.
-    carried = sum((irradiance(lobe, AXES) ** 2).sum(0) for lobe in lobes)
+    carried = sum((irradiance(resize_environment(lobe, *BOUND_MAP), AXES) ** 2).sum(0) for lobe in lobes)
     back = np.sqrt(np.divide(direct, carried, out=np.ones(3), where=carried > 0))
     found = [_radiance(f"sky_{name}", "sky", lobe * back, rgb) for name, lobe in zip(AXIS_NAMES, lobes, strict=True)]
     if unseen.any():
