@@ -6,8 +6,9 @@ as the tripod's ball photograph over the plate, needs no albedo; a card of known
 Lit surfaces of unknown albedo say nothing, as albedo and flux are one product there; nor are lit and shaded faces of a
 box asked, which say as much as they share one albedo and the light at the box is known: of a sun that gives 6 times the
 sky on the lit face, hypot(albedo, light) * 7 / 6, so 6 % at 2 and 5 %, 13 % at 10 and 5 %, where a shadow gives 1.3 %
-and a card 5 %. What is not told apart is named and stays a lower bound. Limits: light from afar; the plane diffuse enough that a shadow is its loss of irradiance; an
-error of scale that the whole map has (the ball's reflectance) the fluxes share.
+and a card 5 %. What is not told apart is named and stays a lower bound. Limits: light from afar; the plane diffuse
+enough that a shadow is its loss of irradiance; an error of scale that the whole map has (the ball's reflectance) the
+fluxes share.
 """
 
 from __future__ import annotations
