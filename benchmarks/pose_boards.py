@@ -176,7 +176,7 @@ def corner_noise(corners: list[np.ndarray]) -> dict[str, float]:
     means = np.array([part.mean(0) for part in corners])
     return {
         "corner_rms_px": float(np.sqrt((every**2).mean())), "corner_mean_rms_px": float(np.sqrt((means**2).mean())),
-        "corner_bias_px": float(np.abs(every.mean(0)).max()), "corner_sigma_stated_px": SIGMA_PX,
+        "corner_bias_px": float(np.abs(every.mean(0)).max()),
         "corners": len(every),
     }  # fmt: skip
 

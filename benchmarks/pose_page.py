@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.probe_page import OURS, PEER, percent, plain_ticks
+from pipeline.camera.resection import SHARED_PX
 
 COLOURS = (OURS, "#2563eb", "#0f9d76", "#d97706", "#7c3aed")
 MEANT = {
@@ -171,9 +172,9 @@ def board_lines(boards: dict[str, Any]) -> list[str]:
     return [
         *lines, "",
         f"Corners have an error of {boards['corner_rms_px']:.3f} px rms ({boards['corner_bias_px']:.4f} px in the mean "
-        f"of all, {boards['corner_mean_rms_px']:.3f} px rms in a photograph's mean); stage pose assumes "
-        f"{boards['corner_sigma_stated_px']:g} px, which paper, demosaicking and clipped edges may use up. So "
-        f"regions are wide here: {boards['true_lens']['held_95']:.0%} hold the truth with the true lens, "
+        f"of all, {boards['corner_mean_rms_px']:.3f} px rms in a photograph's mean); stage pose takes "
+        f"what a board's residuals say, and {SHARED_PX:g} px that its corners may have in common. Of the 95 % regions "
+        f"{boards['true_lens']['held_95']:.0%} hold the truth with the true lens, "
         f"{boards['calibrated_lens']['held_95']:.0%} with a calibrated one.",
     ]  # fmt: skip
 

@@ -77,7 +77,7 @@ def test_page_says_what_is_missing(tmp_path) -> None:
         "coverage": dict.fromkeys(pose_coverage.ROUTES, route),
         "markers": [cell | {"ours_flipped": 0, "opencv_flipped": 2}],
         "boards": {"photographs": 8, "true_lens": lens, "calibrated_lens": lens, "corner_rms_px": 0.03,
-                   "corner_bias_px": 0.001, "corner_mean_rms_px": 0.01, "corner_sigma_stated_px": 0.1},
+                   "corner_bias_px": 0.001, "corner_mean_rms_px": 0.01},
         "real": {"herzjesu": {}, "abakisita": {}, "captures": {}},
     }  # fmt: skip
     record = {**figures(record), "threads": 2, "cpu_seconds": {"boards": 1.0}, **record}
