@@ -21,12 +21,12 @@ FLAG_DISTANCE_RATIO, FLAG_RADIUS_PX, REFUSE_RADIUS_PX = 3.0, 40.0, 12.0
 # with the plane's mirror image by 0.02 to 0.3.
 MIN_VISIBLE, MIN_VISIBLE_ANCHORED = 0.7, 0.4
 # Share of azimuths that see the outline, chance taken off, times the root of their number, from which it is a ball.
-# Where there was none (`benchmarks.probe_finding` on five plates and 24 photographs): a single place had at most 4.4 of
-# 267; the best of a plate's plane, for one size, at most 5.4, and 7.0 in one of a hundred as Gumbel's law has it; the
-# best of a picture, at any size, at most 6.3, and 7.3 in one of a hundred. The round window of a church had 9.4: what
-# is a circle looks like one. Balls had 6.8 to 14. A person vouches for a click. Outlines of 30 px would need nearly all
-# of their azimuths: no false one of any size had a share over 0.62.
-SURE, MOST_NEEDED = {"other_view": 5.0, "plane": 7.0, "anywhere": 7.3, "click": 4.0}, 0.65
+# Where there was none (`benchmarks.probe_finding` on five plates and 24 photographs): a single place had at most 5.4 of
+# 468, 4.4 in one of a hundred; the best of a plate's plane, for one size, at most 5.4 of 35, and 6.4 in one of a hundred
+# as Gumbel's law has it; the best of a picture, at any size, at most 6.3 of 29, and 7.3. The round window of a church
+# had 9.4: what is a circle looks like one. Balls had 6.8 to 14. A person vouches for a click. Outlines of 30 px would
+# need nearly all of their azimuths: no false one of any size had a share over 0.62.
+SURE, MOST_NEEDED = {"other_view": 6.0, "plane": 7.0, "anywhere": 7.3, "click": 4.0}, 0.65
 MAX_RMS_PX = 1.0  # scatter of the rim over sectors: balls had 0.1 to 0.3, a false outline 1.5
 MIN_VISIBLE_ANYWHERE = 0.6
 INNER = (0.3, 0.6, 0.8)  # circles, as fractions of the outline, where a mirror shows something else than the table
