@@ -22,7 +22,7 @@ FLAG_DISTANCE_RATIO, FLAG_RADIUS_PX, REFUSE_RADIUS_PX = 3.0, 40.0, 12.0
 MIN_VISIBLE, MIN_VISIBLE_ANCHORED = 0.7, 0.4
 # Share of azimuths that see the outline, chance taken off, times the root of their number, from which it is a ball.
 # Where there was none (`benchmarks.probe_finding` on five plates and 24 photographs): a single place had at most 5.4 of
-# 468, 4.4 in one of a hundred; the best of a plate's plane, for one size, at most 5.4 of 35, and 6.4 in one of a hundred
+# 468, 4.4 in one of a hundred; the best of a plate's plane, for one size, at most 5.4 of 35, 6.4 in one of a hundred
 # as Gumbel's law has it; the best of a picture, at any size, at most 6.3 of 29, and 7.3. The round window of a church
 # had 9.4: what is a circle looks like one. Balls had 6.8 to 14. A person vouches for a click. Outlines of 30 px would
 # need nearly all of their azimuths: no false one of any size had a share over 0.62.
