@@ -23,7 +23,7 @@ METHOD = """## Method
   decade. In *texture* every pixel has a radiance of its own from its bin: neighbours say little.
 - **Cost**: CPU time of all threads, the least of several turns, five frames in memory; the floor reads five planes of
   uint16 and writes radiance, variance (float32) and mask (uint8) into fresh memory, in as many threads. insitu
-  writes the same, and pays for threads, copies and page faults too.
+  writes the same, and pays for threads and page faults too.
 - **Peers** are given the exposures; a global factor is fitted to the middle of the range. OpenCV takes 8 bits (the
   conversion is not timed), HDRutils' reading and demosaicking are left out. What is not finite counts as zero.
 - **Memory**: peak resident size of a process that holds five frames of 100 megapixels, merges and replaces defects.

@@ -7,7 +7,7 @@ Per photosite and frame i: signal ``x_i = (DN - black) / (white - black)``, expo
 - *optimal*: ``w_i = g_i^2 / (shot_i g_i y' + floor_i)`` with y' the Poisson estimate averaged over the four nearest
   photosites of the same colour in the row, *without* the photosite itself: a weight that depends on the sample's own
   noise biases deep shadows (-0.6 % at 5 electrons). Where all of a stretch of a row has fifty times more shot than
-  read noise the Poisson weights are used: they lose less than 0.1 % there.
+  read noise the Poisson weights are used: they lose 1.1 % at that edge and 0.03 % at ten times its light.
 
 A sample at or above its limit says that the radiance is at least the limit. It enters *as the limit* when the shorter
 frames together lie below it by no more than four sigma, else not at all. To leave all clipped samples out would lose
