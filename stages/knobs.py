@@ -70,9 +70,7 @@ class Calibrate(Params):
 class Pose(Params):
     """Pose of every view."""
 
-    corner_sigma_px: float = Field(
-        0.1, gt=0, description="standard uncertainty of a corner, where no board tells [px]"
-    )
+    corner_sigma_px: float = Field(0.1, gt=0, description="standard uncertainty of a corner, where no board tells [px]")
     min_ambiguity: float = Field(4.0, gt=1, description="refuse when the second pose fits within this chi2 ratio")
 
 
