@@ -67,7 +67,7 @@ def made(wishes: list[dict[str, Any]], **params: Any) -> tuple[dict[str, Any], R
     result = render.compute(
         wishes={"object": wishes}, **given, surface=Surface(), local_proxies=[], params=knobs.Render(**params)
     )
-    return given, result.outputs["layers"]
+    return given | {"proxies": []}, result.outputs["layers"]
 
 
 def test_lights_of_a_real_render_rebuild_the_picture(tmp_path: Path) -> None:
