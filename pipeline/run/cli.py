@@ -333,7 +333,7 @@ def with_build(args: argparse.Namespace) -> int:
         return 0
     os.environ.setdefault("OMP_NUM_THREADS", str(os.cpu_count()))
     from pipeline.run.derive import print_summary
-    from pipeline.run.formats import use_threads
+    from pipeline.run.formats import threads
     from pipeline.run.progress import shown
     from pipeline.run.runner import Build
     from stages.order import graph
@@ -354,8 +354,7 @@ def with_build(args: argparse.Namespace) -> int:
         return 4 if problems else 0
     if args.verb == "stmap":
         return straightened(args, build)
-    use_threads()
-    with shown(), build.stop.listening():
+    with threads(), shown(), build.stop.listening():
         return at_work(args, build, last)
 
 

@@ -56,14 +56,21 @@ def write_bytes(path: Path, data: bytes) -> None:
         scratch.write_bytes(data)
 
 
-def use_threads() -> None:
-    """Let this process compress and expand EXR files on all cores; the bytes are the same.
+@contextlib.contextmanager
+def threads() -> Iterator[None]:
+    """Compress and expand EXR files on all cores; the bytes are the same.
 
-    For commands only: threads do not survive a fork, and a child that waits for them waits for ever.
+    For commands only, and ended with them: threads do not survive a fork, and a child that waits for them waits for
+    ever.
     """
     import OpenEXR
 
+    before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(os.cpu_count() or 1)
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(before)
 
 
 def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
