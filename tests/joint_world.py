@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.camera.bundle import Bundle, Corners
 from pipeline.camera.lens import project
 from pipeline.camera.markers import marker_points
+from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.rigid import camera_points, perturb
 from pipeline.conventions import transform_points
 from pipeline.simulation.lens import look_at

@@ -7,7 +7,8 @@ import pytest
 from joint_world import CAMERA, CORNER_PX, CORNERS, TRACK_PX, noisy, world
 
 from pipeline.camera.adjustment import free_columns
-from pipeline.camera.bundle import Adjusted, Bundle, adjust
+from pipeline.camera.bundle import Adjusted, adjust
+from pipeline.camera.reprojection import Bundle
 from pipeline.camera.rigid import difference, umeyama
 from pipeline.conventions import transform_points
 from pipeline.run.errors import NumericalError

@@ -14,10 +14,10 @@ import numpy as np
 
 from pipeline.camera.board_families import Layout, find_markers, layout_of
 from pipeline.camera.board_kinds import kind_of, points_on, turns_alike
-from pipeline.camera.bundle import Bundle, Corners
 from pipeline.camera.lens import pixel_rays, project, unproject
 from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import Sightings
+from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.rigid import camera_points, umeyama
 from pipeline.camera.sights import FEWEST_CORNERS, eight_bit, sighted_board, sighted_marker
 from pipeline.conventions import WORLD_FROM_BOARD, transform_points

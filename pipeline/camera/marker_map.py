@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.camera.bundle import Adjusted, Bundle, Corners, adjust, settled
+from pipeline.camera.bundle import Adjusted, adjust, settled
+from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.resection import Resection, minimise, refine, resect_plane, residuals_and_jacobian
 from pipeline.camera.rigid import difference
 from pipeline.camera.sfm import Seen

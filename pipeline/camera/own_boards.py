@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.camera.adjustment import free_columns, lens_vector
-from pipeline.camera.bundle import Adjusted, Bundle, Corners, adjust
+from pipeline.camera.bundle import Adjusted, adjust
+from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.run.errors import NumericalError

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera.adjustment import free_columns, lens_vector, with_lens
-from pipeline.camera.bundle import Adjusted, Bundle, Corners, adjust
+from pipeline.camera.bundle import Adjusted, adjust
 from pipeline.camera.exif_camera import equivalent_focal_px
 from pipeline.camera.lens import pixel_rays
+from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.rigid import umeyama
 from pipeline.conventions import transform_points
 from pipeline.run.errors import NumericalError
