@@ -26,7 +26,7 @@ from pipeline.image.display import auto_exposure
 from pipeline.image.truth import Truth, load_truth, read_acescg
 from pipeline.light import ball_shadow, near_field, prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
-from pipeline.probes import clipped
+from pipeline.probes import shadow_flux
 from pipeline.run.artifacts import (
     ALBEDO,
     BALANCE,
@@ -268,9 +268,9 @@ def shadow_check(
     )
     if not usable.any():
         return {"points": 0}
-    rest = clipped.setting(light, np.zeros_like(light), [])
+    rest = shadow_flux.setting(light, np.zeros_like(light), [])
     blocked, mirrored = (
-        clipped.shadow_of(rest, points[usable], ball_shadow.Ball(centre, ball.radius_m, reflectance))
+        shadow_flux.shadow_of(rest, points[usable], ball_shadow.Ball(centre, ball.radius_m, reflectance))
         for reflectance in (np.zeros(3), ball.reflectance)
     )
     far = np.abs(mirrored - 1).max(-1) < UNCHANGED

@@ -23,6 +23,7 @@ from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environ
 from pipeline.probes import clipped, combine, filling, ground_gloss, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
+from pipeline.probes.witness import Witness, witness_of
 from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS, WISHES
 from pipeline.run.errors import CaptureError
 from pipeline.run.stage import Stage
@@ -49,7 +50,7 @@ def compute(
     plate, eye = lookup_channels(photographs["plate"])[..., :7], views["plate"].world_from_camera
     below = combine.plate_below(plate, camera, eye, observed.centre_world, merged.seen.shape)
     over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - below.share)
-    witness = clipped.witness(shots, observed) if over.any() else clipped.Witness()
+    witness = witness_of(shots, observed) if over.any() else Witness()
     whole = completed(merged, shared, below, over, witness)
     gloss = ground_gloss.assess(
         whole.lamps.rgb, merged.rgb, merged.seen, below, plate, camera, eye, observed.centre_world
@@ -110,7 +111,7 @@ class Whole:
 
 
 def completed(
-    merged: combine.Merged, shared: np.ndarray, below: combine.Below, over: np.ndarray, witness: clipped.Witness,
+    merged: combine.Merged, shared: np.ndarray, below: combine.Below, over: np.ndarray, witness: Witness,
     gloss: ground_gloss.Gloss | None = None,
 ) -> Whole:  # fmt: skip
     """From what the probe saw to a map of all directions; with ``gloss``, what is filled shows its mirror images."""

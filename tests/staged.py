@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.conventions import invert_rigid, latlong_directions, transform_points
 from pipeline.light import ball_shadow, prediction
 from pipeline.light.harmonics import COSINE_LOBE, sh9_of_environment
-from pipeline.probes import clipped
+from pipeline.probes import shadow_flux
 from pipeline.run import formats
 from pipeline.types import BallFit, Camera, Harmonics, Plane, Raster, View
 
@@ -115,8 +115,8 @@ def ball_photograph(camera, view, ball, light, with_shadow) -> np.ndarray:
     near = np.isfinite(hits[:, 0]) & (np.linalg.norm(hits - CENTRE, axis=-1) < 5.5 * RADIUS)
     near &= np.linalg.norm(hits - CENTRE, axis=-1) > RADIUS * 1.001
     if with_shadow:
-        rest, mirror = clipped.setting(light, 0 * light, []), ball_shadow.Ball(CENTRE, RADIUS, np.ones(3))
-        picture[near] *= clipped.shadow_of(rest, hits[near], mirror)
+        rest, mirror = shadow_flux.setting(light, 0 * light, []), ball_shadow.Ball(CENTRE, RADIUS, np.ones(3))
+        picture[near] *= shadow_flux.shadow_of(rest, hits[near], mirror)
     picture = picture.reshape(HEIGHT, WIDTH, 3)
     directions, sine = prediction.ball_directions(camera, ball, view.world_from_camera, *whole)
     mirrored = prediction.mirrored_picture(light, directions, np.ones(3))

@@ -12,6 +12,7 @@ from pipeline.light.environment import irradiance, resize_environment
 from pipeline.probes import cards, clipped
 from pipeline.probes.grey_ball import sphere_normals
 from pipeline.probes.observation import Shots
+from pipeline.probes.witness import Witness
 from pipeline.run.manifest import ReferenceFacts
 from pipeline.types import Raster
 
@@ -69,7 +70,7 @@ def lit(light: np.ndarray) -> np.ndarray:
 
 def recovered(light, found: cards.Cards):
     rgb, over, _ = light
-    result = clipped.recover(rgb, (0.005 * rgb) ** 2, over, clipped.Witness(cards=found))
+    result = clipped.recover(rgb, (0.005 * rgb) ** 2, over, Witness(cards=found))
     return result.numbers["clipped_lights"][0], result.numbers
 
 

@@ -14,10 +14,11 @@ from pipeline.conventions import CLIPPED, invert_rigid, latlong_directions, latl
 from pipeline.light import ball_shadow
 from pipeline.light.environment import irradiance
 from pipeline.light.flux import Card, Shadow, predicted, solve
-from pipeline.probes import clipped
+from pipeline.probes import clipped, shadow_flux
 from pipeline.probes.cards import Cards
 from pipeline.probes.clipped_lights import find_lights
 from pipeline.probes.shadow_blocks import MODEL, plane_blocks
+from pipeline.probes.witness import Witness
 from pipeline.types import BallFit, Raster
 from stages import knobs
 from stages import lights as room
@@ -31,7 +32,7 @@ COLOUR = np.array([1.0, 0.9, 0.8])
 @pytest.fixture(autouse=True)
 def fewer_points(monkeypatch):
     """Half the points of the product: twice as quick."""
-    monkeypatch.setattr(clipped, "POINTS", 800)
+    monkeypatch.setattr(shadow_flux, "POINTS", 800)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def case(scene, pictures, strengths, columns: slice = slice(None), unmapped: tup
     blocks = plane_blocks(rasters[0], rasters[1], camera, scene.world_from_camera, fit)
     mapped = [np.zeros(3) if number in unmapped else flux for number, flux in enumerate(fluxes)]
     rgb, over = flux_scene.true_map(scene, mapped, CLIP)
-    seen = clipped.Witness(
+    seen = Witness(
         ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance), blocks,
         shift=np.array([0, 0, 5e-5]), eye=scene.world_from_camera[:3, 3],
     )  # fmt: skip
@@ -184,7 +185,7 @@ def test_a_clipped_window_leaves_the_others_open(scene, pictures):
     rasters = [flux_scene.raster(one, np.inf, seed) for seed, one in enumerate((ball, plate))]
     blocks = plane_blocks(*rasters, scene.camera, scene.world_from_camera, ball_fit(scene))
     place = ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance)
-    found = clipped.recover(rgb, rgb**2, over, clipped.Witness(place, blocks))
+    found = clipped.recover(rgb, rgb**2, over, Witness(place, blocks))
     whys = [row["why_not"] for row in found.numbers["clipped_lights"]]
     assert "degrees wide" in whys[0]
     assert "another clipped light" in whys[1]
@@ -193,7 +194,7 @@ def test_a_clipped_window_leaves_the_others_open(scene, pictures):
 
 def test_without_a_tripod_view_the_bound_stays(scene, pictures):
     rgb, over = flux_scene.true_map(scene, [20 * COLOUR, *np.zeros((3, 3))], CLIP)
-    found = clipped.recover(rgb, rgb**2, over, clipped.Witness())
+    found = clipped.recover(rgb, rgb**2, over, Witness())
     (row,) = found.numbers["clipped_lights"]
     assert row["lower_bound"]
     assert "tripod" in found.warnings[0]
@@ -203,7 +204,7 @@ def test_without_a_tripod_view_the_bound_stays(scene, pictures):
 
 def test_nothing_clipped_changes_nothing(scene):
     rgb, over = flux_scene.true_map(scene, list(np.zeros((4, 3))), CLIP)
-    found = clipped.recover(rgb, rgb**2, over, clipped.Witness())
+    found = clipped.recover(rgb, rgb**2, over, Witness())
     assert np.array_equal(found.rgb, rgb)
     assert found.warnings == []
     assert [reason["because"] for reason in found.evidence] == ["nothing is clipped in every frame"]
@@ -220,7 +221,7 @@ def test_a_card_of_known_albedo_is_evidence_too(scene, pictures):
     plane_lit = np.where(below, rgb, sky)
     measured = (plane_lit * weight[..., None]).sum((0, 1)) + flux * (normal @ scene.lamps[0].direction)
     found = clipped.recover(
-        rgb, (0.01 * rgb) ** 2, over, clipped.Witness(cards=Cards(measured[None], 0.005 * measured[None], normal[None]))
+        rgb, (0.01 * rgb) ** 2, over, Witness(cards=Cards(measured[None], 0.005 * measured[None], normal[None]))
     )
     check(found.numbers["clipped_lights"][0], flux)
 
@@ -250,7 +251,7 @@ def test_one_card_does_not_tell_two_lamps_and_two_cards_do(scene):
 
     def told(cards: int) -> tuple[list, clipped.Recovered]:
         seen = Cards(light[:cards], 0.005 * light[:cards], normals[:cards])
-        found = clipped.recover(rgb, (0.01 * rgb) ** 2, over, clipped.Witness(cards=seen))
+        found = clipped.recover(rgb, (0.01 * rgb) ** 2, over, Witness(cards=seen))
         return found.numbers["clipped_lights"], found
 
     rows, found = told(1)
@@ -348,7 +349,7 @@ def test_the_shadow_of_a_known_map_is_that_of_the_photographs(scene, pictures, s
     blocks = plane_blocks(*rasters, scene.camera, scene.world_from_camera, ball_fit(scene))
     rgb, _ = flux_scene.true_map(scene, fluxes, np.inf)
     place = ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance)
-    predicted = clipped.shadow_of(clipped.setting(rgb, 0 * rgb, []), blocks.points, place)
+    predicted = shadow_flux.shadow_of(shadow_flux.setting(rgb, 0 * rgb, []), blocks.points, place)
     clear = np.ones(len(blocks.points), bool)
     for lamp, strength in zip(scene.lamps, strengths, strict=True):
         edge = ball_shadow.edge_angle(blocks.points, lamp.direction, place)

@@ -11,8 +11,9 @@ from small_plates import CAMERA, VIEW, lamp_and_sky, photograph, texture, tracer
 
 from pipeline.conventions import direction_from_latlong, latlong_directions
 from pipeline.light.environment import AXES, irradiance
-from pipeline.probes import clipped, combine, ground_gloss
+from pipeline.probes import combine, ground_gloss
 from pipeline.probes.observation import lookup_channels
+from pipeline.probes.witness import Witness
 from stages.probe import completed
 
 LAMP = lamp_and_sky(400.0, (0.05, 0.62, -0.75))  # its mirror image lies in the middle of the plate
@@ -119,7 +120,7 @@ def test_filled_directions_show_the_mirror_image():
     hole[36 + row : 45 + row, (column + np.arange(-6, 7)) % WIDTH] = 0
     merged = combine.Merged(truth, np.full(truth.shape, 1e-6), hole, np.ones(hole.shape), np.ones((1, *hole.shape)))
     laid, none = dataclasses.replace(found.below, share=found.below.share * hole), np.zeros(hole.shape)
-    shown, dull = (completed(merged, np.zeros(3), laid, none, clipped.Witness(), one) for one in (found, None))
+    shown, dull = (completed(merged, np.zeros(3), laid, none, Witness(), one) for one in (found, None))
     gap = hole == 0
     light = truth[gap].sum(0)
     assert (shown.lamps.rgb[gap].sum(0) / light) == pytest.approx(np.ones(3), abs=0.2)  # measured 1.00; without, 0.57

@@ -12,7 +12,7 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 from pipeline.conventions import CLIPPED, direction_from_latlong, invert_rigid, latlong_directions, transform_points
 from pipeline.light import near_field
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
-from pipeline.probes import clipped, reflection
+from pipeline.probes import reflection, shadow_flux
 from pipeline.probes.combine import merge
 from pipeline.probes.filling import fill
 from pipeline.probes.kinds import KINDS
@@ -290,7 +290,7 @@ def test_one_view_marks_what_it_does_not_see(shots):
 
 
 def test_clipped_lamp_is_a_lower_bound(shots, monkeypatch):
-    monkeypatch.setattr(clipped, "POINTS", 400)  # what the shadow tells is tested in test_clipped
+    monkeypatch.setattr(shadow_flux, "POINTS", 400)  # what the shadow tells is tested in test_clipped
     photographs = dict(shots["photographs"])
     old = photographs["ball_a"]
     over = old["G"] > 20
