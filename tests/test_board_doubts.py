@@ -20,6 +20,7 @@ from pipeline.camera.markers import tone
 from pipeline.camera.opencv_bridge import board_sightings, first_calibration, repeated
 from pipeline.camera.rigid import camera_points
 from pipeline.camera.sights import sighted_marker
+from pipeline.image.brackets import check_zoom
 from pipeline.probes.finding import Found, complaints
 from pipeline.probes.outline import Height
 from pipeline.run.errors import CaptureError
@@ -297,7 +298,7 @@ def test_metadata_of_files_are_asked(tmp_path):
     assert flaws == ["2.jpg: focal length 35 mm, the other board photographs 24 mm; needed one; take it out"]
     plate = SimpleNamespace(role="plate", frames=[frame("p.dng", focal_mm=35.0)])
     flaws.clear()
-    ingest._check_zoom({"plate": plate}, {"plate": frames["plate"][:2]}, flaws, [])  # type: ignore[dict-item]
+    check_zoom({"plate": plate}, {"plate": frames["plate"][:2]}, flaws, [])  # type: ignore[dict-item]
     assert flaws[0].startswith("plate: taken at 35 mm, its board photographs at 24 mm; needed one focal length")
 
 
