@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.random_scenes import Case, random_case
+from pipeline.transport.canvas import Canvas, pictures
 from pipeline.transport.denoise import TILE, tile_means
 from pipeline.transport.difference import difference_block
-from pipeline.transport.estimate import Canvas, Effort, pictures, prepare, sampled
+from pipeline.transport.estimate import prepare, sampled
 from pipeline.transport.passes import Halves
+from pipeline.transport.pilot import Effort
 from pipeline.transport.region import Region, limits_for
 from pipeline.transport.trace import trace, unchanged_block
 

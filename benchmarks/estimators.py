@@ -21,8 +21,9 @@ from pipeline.light.environment import irradiance
 from pipeline.transport.caustics import Film, photons_for, thrown
 from pipeline.transport.denoise import denoise
 from pipeline.transport.difference import difference_block
-from pipeline.transport.estimate import Effort, Shot, prepare, sampled
+from pipeline.transport.estimate import Shot, prepare, sampled
 from pipeline.transport.meshes import Material, Mesh
+from pipeline.transport.pilot import Effort
 from pipeline.transport.region import limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import color_texture, mesh_shape

@@ -25,10 +25,12 @@ from pipeline.run import progress
 from pipeline.run.errors import ManifestError
 from pipeline.run.formats import data_window
 from pipeline.run.stage import Stage
+from pipeline.transport.canvas import Canvas
 from pipeline.transport.caustics import Film
-from pipeline.transport.estimate import WORTH_TRACING, Canvas, Effort, Shot, lit, prepare, sampled
+from pipeline.transport.estimate import WORTH_TRACING, Shot, lit, prepare, sampled
 from pipeline.transport.near_one import near_one
 from pipeline.transport.passes import Halves, Interrupted
+from pipeline.transport.pilot import Effort
 from pipeline.transport.placing import feet, place_objects
 from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds

@@ -15,21 +15,12 @@ from test_transport import GREY, SIZE, all_rays, ground, looking_down, sky, sphe
 from pipeline.camera.lens import ray_grid
 from pipeline.light.environment import irradiance
 from pipeline.transport import passes
+from pipeline.transport.canvas import TRUSTED, Canvas, pictures
 from pipeline.transport.difference import difference_block
-from pipeline.transport.estimate import (
-    TRUSTED,
-    Canvas,
-    Effort,
-    Pilot,
-    lit,
-    looked,
-    pictures,
-    prepare,
-    sampled,
-    settled,
-)
+from pipeline.transport.estimate import lit, prepare, sampled, settled
 from pipeline.transport.meshes import Material, Mesh
 from pipeline.transport.passes import OBJECT_BOOST, Halves
+from pipeline.transport.pilot import Effort, Pilot, looked
 from pipeline.transport.region import BLUR, CELL, Limits, limits_for, near_objects
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.surfaces import material_bsdf, object_shape
