@@ -11,7 +11,7 @@ from mirror_scene import Lamp, Place, look_at, photograph, sky
 from benchmarks.probe_fit import Setup, fitted
 from pipeline.camera.lens import project
 from pipeline.conventions import invert_rigid, transform_points
-from pipeline.probes.anchor import anchored, anchored_radius
+from pipeline.probes.anchor import MOST_LEFT_PX, anchored, anchored_radius
 from pipeline.probes.finding import Found, measured, refuse_cut
 from pipeline.probes.outline import Height, part_of, radius_in_pixels
 from pipeline.probes.plane_image import Aligned, align
@@ -30,7 +30,11 @@ SIGMA = np.diag([0.5 * PIXEL, 0.5 * PIXEL, 0.01 * RADIUS]) ** 2  # a rim that ma
 @pytest.fixture(scope="module")
 def picture() -> Raster:
     place = Place(sky([Lamp((0.3, 0.8, 0.4), 0.06, 50.0)]), plane=True, reflectance=0.8)
-    rgb = photograph(place, CAMERA, POSE, 3, 0.005, 1)
+    return raster_of(photograph(place, CAMERA, POSE, 3, 0.005, 1))
+
+
+def raster_of(rgb: np.ndarray) -> Raster:
+    """The photograph with its variance, and nothing masked."""
     noise = {"variance.R": rgb[..., 0], "variance.G": rgb[..., 1], "variance.B": rgb[..., 2]}
     variance = {name: (0.005 * value) ** 2 for name, value in noise.items()}
     return Raster({**Raster.split(rgb), **variance, "mask": np.zeros(rgb.shape[:2], np.uint32)}, "acescg")
@@ -72,6 +76,43 @@ def test_plane_that_agrees_with_its_image_is_believed_against_the_rim(picture):
     assert numbers["used"]
     assert numbers["against_the_rim"]
     assert across_px(found) < 0.24  # as above, without the rim's pull
+
+
+class Varnished(Place):
+    """The plane, but not the board on it, mirrors a soft window: it lies elsewhere for the camera than for the ball."""
+
+    def radiance(self, origin: np.ndarray, w: np.ndarray) -> np.ndarray:
+        rgb = super().radiance(origin, w)
+        below = w[:, 1] < -1e-9
+        x, z = (origin - (origin[:, 1] / np.where(below, w[:, 1], 1))[:, None] * w)[:, ::2].T
+        bare = below & ~((x > 0.1) & (x < 0.3) & (np.abs(z) < 0.1))
+        window = np.array([-0.5, 0.7, -0.4]) / np.sqrt(0.9)
+        shine = 0.5 * np.exp(((w * (1, -1, 1)) @ window - 1) / 0.06)  # the wood's own radiance is 0.5
+        return rgb + np.where(bare, shine, 0)[:, None] * (0.8, 1.0, 1.2)
+
+
+@pytest.fixture(scope="module")
+def varnished() -> Raster:
+    place = Varnished(sky([Lamp((0.3, 0.8, 0.4), 0.06, 50.0)]), plane=True, reflectance=0.8)
+    return raster_of(photograph(place, CAMERA, POSE, 3, 0.005, 1))
+
+
+@pytest.mark.parametrize("off_px", [(1.0, 0.0), (-0.7, 0.8)])
+def test_gloss_beside_print_changes_contrast_and_moves_nothing(varnished, off_px):
+    start = ball(off_px)
+    as_is = align(varnished, CAMERA, VIEW, start.fit.centre, RADIUS, start.fit.blur_px)
+    assert as_is is not None
+    assert as_is.left_px > MOST_LEFT_PX
+    found, numbers = anchored(start, varnished, CAMERA, VIEW, RADIUS)
+    assert numbers["used"]
+    assert numbers["left_with_its_contrast_px"] == as_is.left_px
+    error = found.fit.centre - transform_points(invert_rigid(POSE), CENTRE)
+    assert error @ np.linalg.solve(found.fit.covariance, error) < 11.3  # 99 %
+    assert across_px(found) < 0.5 * across_px(
+        start
+    )  # 0.22 and 0.31; an image with its contrast is off by 1.3 and 1.9 px
+    sure = replace(ball((2.5, 0.0)), fit=replace(ball((2.5, 0.0)).fit, covariance=1e-2 * SIGMA))
+    assert not anchored(sure, varnished, CAMERA, VIEW, RADIUS)[1]["used"]  # against a sure rim it is not believed
 
 
 @pytest.mark.parametrize(("radius_px", "ratio", "blur_px"), [(30.0, 10.0, 0.6), (60.0, 3.0, 0.6), (60.0, 50.0, 1.2)])

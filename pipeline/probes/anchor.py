@@ -3,7 +3,9 @@
 A mirror's rim continues its background, so that one side of it can drift by a pixel and more. The plane's texture is
 seen twice, directly and in the ball, and where its mirror image lies depends on the centre alone (`plane_image`). Both
 are joined by their covariances; where they contradict each other, a plane that agrees with its image to a third of a
-pixel is believed. Needs a plane with texture near the ball, and the ball standing on it.
+pixel is believed. Needs a plane with texture near the ball, and the ball standing on it. Where no sphere fits the image
+its contrast is left free, as gloss changes it and moves nothing (`contrast`); such an image is never believed against
+the rim.
 """
 
 from __future__ import annotations
@@ -66,26 +68,36 @@ def anchored(
     """The ball with its centre joined with the mirrored plane's, and what that measured; as it was where it cannot."""
     if not ball.on_plane:
         return ball, {"used": False, "why": "the ball is not on the plane"}
-    aligned = plane_image.align(photograph, camera, view, ball.fit.centre, radius, ball.fit.blur_px, glass)
-    if aligned is None:
+    start = ball.fit.centre
+    as_is = aligned = plane_image.align(photograph, camera, view, start, radius, ball.fit.blur_px, glass)
+    if as_is is None or aligned is None:
         return ball, {"used": False, "why": "too little of the plane's texture is mirrored"}
+    if free := as_is.left_px > MOST_LEFT_PX:
+        aligned = plane_image.align(photograph, camera, view, start, radius, ball.fit.blur_px, glass, free) or as_is
     centre, covariance = aligned.centre, aligned.covariance
     moved = centre - ball.fit.centre
     chi2 = float(moved @ np.linalg.solve(ball.fit.covariance + covariance, moved))
     pixels = float(np.linalg.norm(moved - (moved @ centre) / (centre @ centre) * centre) * ball.fit.radius_px / radius)
-    numbers = {"moved_px": pixels, "chi2": chi2, "left_px": aligned.left_px}
+    numbers: dict[str, Any] = {"moved_px": pixels, "chi2": chi2, "left_px": aligned.left_px}
+    if free:
+        numbers["left_with_its_contrast_px"] = as_is.left_px
     if aligned.left_px > MOST_LEFT_PX:
         return ball, {"used": False, "why": "no sphere fits the plane's mirror image", **numbers}
     numbers["against_the_rim"] = chi2 > MOST_CHI2
     if chi2 <= MOST_CHI2:
         fit = sphere_fit.joined(ball.fit, radius, moved, covariance, camera)
-    elif aligned.left_px <= SURE_PX and pixels <= MOST_MOVED_PX and stands(ball, centre, covariance, radius):
+    elif not free and believable(aligned, pixels) and stands(ball, centre, covariance, radius):
         seen = replace(ball.free, centre=centre, covariance=covariance)
         fit = sphere_fit.standing(seen, radius, ball.height, camera)
     else:
         return ball, {"used": False, "why": "rim and mirrored plane disagree", **numbers}
     there = transform_points(view.world_from_camera, fit.centre)
     return replace(ball, fit=fit, centre_world=there), {"used": True, **numbers}
+
+
+def believable(aligned: plane_image.Aligned, pixels: float) -> bool:
+    """Whether an image that says a centre this many pixels away may overrule the rim."""
+    return aligned.left_px <= SURE_PX and pixels <= MOST_MOVED_PX
 
 
 def stands(ball: Found, centre: np.ndarray, covariance: np.ndarray, radius: float) -> bool:

@@ -333,6 +333,11 @@ def centred(anchors: dict[str, dict[str, Any]]) -> dict[str, Any]:
     said = [
         f"{name}: moved by {one['moved_px']:.2f} px, chi2 {one['chi2']:.1f}, {one['left_px']:.2f} px left"
         + ", believed against the rim" * one["against_the_rim"]
+        + (
+            f", its contrast left free as with it {one['left_with_its_contrast_px']:.2f} px are: gloss"
+            if "left_with_its_contrast_px" in one
+            else ""
+        )
         if one["used"]
         else f"{name}: {one['why']}"
         for name, one in anchors.items()

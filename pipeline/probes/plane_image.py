@@ -5,6 +5,7 @@ to the plane and on to where that point is seen directly (`ball_pairs`), which p
 is moved until both agree (Lucas and Kanade 1981, with the centre instead of a shift), from coarse to fine. The
 logarithm is compared and its broad parts are taken off, so that reflectance, dirt and gloss change nothing, and a
 Laplacian takes up that both are blurred unequally. All textured pixels speak, so that a ball of 30 px is enough.
+Gloss that differs by place (a print on a lacquered table) needs more: the contrast is then left free (`contrast`).
 
 What is left scatters more than noise and neighbours share it: the covariance is clustered by blocks (sandwich; White
 1980). The pose moves all of them at once and comes in by its own covariance.
@@ -19,6 +20,7 @@ import numpy as np
 from pipeline.camera.lens import pixel_rays, project
 from pipeline.conventions import invert_rigid, transform_points
 from pipeline.probes.ball_pairs import Sight, ball_points, neighbourhood, plane_pairs
+from pipeline.probes.contrast import local_gain, means, ramps, windowed
 from pipeline.probes.glass import Glass
 from pipeline.types import Camera, Raster, View
 
@@ -41,7 +43,10 @@ MAX_CONDITION = 1e5
 
 @dataclass(frozen=True)
 class Aligned:
-    """Centre (3,) [m], camera frame, with covariance (3, 3); ``left_px``: what no centre explains, as a shift."""
+    """Centre (3,) [m], camera frame, with covariance (3, 3); ``left_px``: what no centre explains, as a shift.
+
+    Where the contrast was left free it is the shift alone: what differs otherwise is the contrast's.
+    """
 
     centre: np.ndarray
     covariance: np.ndarray
@@ -51,9 +56,9 @@ class Aligned:
 
 @dataclass(frozen=True)
 class Equations:
-    """Weighted equations of the pixels: residual (N,), by centre and blur (N, 4), by pose (N, 6), slope (N,).
+    """Weighted equations of the pixels: residual (N,), by centre and blur (N, 4), by pose (N, 6), slope (N, 2).
 
-    With glass asked for, its thickness, of the radius, is a fifth column.
+    With glass asked for, its thickness, of the radius, is a fifth column. ``free``: the contrast was.
     """
 
     left: np.ndarray
@@ -62,16 +67,18 @@ class Equations:
     slope: np.ndarray
     weight: np.ndarray
     block: np.ndarray
+    free: bool
 
 
 def align(
     photograph: Raster, camera: Camera, view: View, centre: np.ndarray, radius: float, blur_px: float,
-    glass: Glass | None = None,
+    glass: Glass | None = None, free: bool = False,
 ) -> Aligned | None:  # fmt: skip
     """The centre (3,) that makes ball and plane agree, started at ``centre`` [m, camera frame], good to a few pixels.
 
-    ``blur_px``: of the photograph, to start with; what is seen in the ball is much reduced before it is blurred. None
-    when too few pixels mirror a textured part of the plane that is in the frame, or these leave the centre open.
+    ``blur_px``: of the photograph, to start with; what is seen in the ball is much reduced before it is blurred.
+    ``free``: the contrast may differ from place to place. None when too few pixels mirror a textured part of the plane
+    that is in the frame, or these leave the centre open.
     """
     start, blurred, inset = 0.0, None, 0
     for smooth in SMOOTH_PX:
@@ -80,7 +87,7 @@ def align(
         if blurred is None:
             start = blurred = max((blur_px / sight.binned) ** 2 - RAYS_BLUR, 0.0)
             inset = int(min(np.ceil(INSET_BLURS * np.sqrt(start)), np.ceil(MOST_INSET * radius / pixel)))
-        equations = equations_of(sight, smooth, blurred, inset, pixel)
+        equations = equations_of(sight, smooth, blurred, inset, pixel, free=free)
         if equations is None:
             return None
         wider, wider_sigma = 0.5 * (start - blurred), 0.5 * BLUR_SIGMA * (start + RAYS_BLUR)
@@ -105,11 +112,12 @@ def size_px(sight: Sight) -> float:
 
 
 def equations_of(
-    sight: Sight, smooth: float, blurred: float, inset: int, pixel: float, with_glass: bool = False
+    sight: Sight, smooth: float, blurred: float, inset: int, pixel: float, with_glass: bool = False,
+    free: bool = False,
 ) -> Equations | None:  # fmt: skip
     """How the ball's picture differs from its prediction, and how that goes with the centre: pixels of metre ``pixel``.
 
-    Columns are in pixels: a change of the centre by ``pixel`` metres.
+    Columns are in pixels: a change of the centre by ``pixel`` metres. ``free``: up to local contrast.
     """
     limit = 1 - max(1 - RIM, EDGE_BLURS * np.sqrt(blurred + RAYS_BLUR) * pixel / sight.radius)
     pairs = plane_pairs(sight, PREDICTED, every=True, split=int(np.clip(RAYS * pixel / sight.radius, 3, 8)))
@@ -139,34 +147,33 @@ def equations_of(
         return None
     used = grid(use)
     far = max(BROAD_PX, 3 * smooth)
-    broad = np.maximum(_blurred(used, far), 1e-6)
+    under = ramps(used, far) if free else means(used, far)
 
     def sharp(values: np.ndarray) -> np.ndarray:
-        return np.asarray((values - _blurred(values * used, far) / broad)[at][use])
+        return np.asarray((values - under(values))[at][use])
 
+    left = sharp(real - model)
+    if free:
+        there, detail = (used * (part - under(part)) for part in (real, model))
+        gain = local_gain(there, detail, far)
+        left = np.asarray((there - gain * detail)[at][use])
+        slope, bend = gain[..., None] * slope, gain * bend
     moved = -np.einsum("ni,nij->nj", slope[at], np.nan_to_num(shift))
     columns = [sharp(grid(moved[:, k])) * pixel for k in range(3)] + [sharp(bend)]
     columns += [sharp(grid(moved[:, 9]))] if with_glass else []
-    steep = np.linalg.norm(slope[at], axis=1)[use]
+    steep = slope[at][use]
     noise = (pairs.mirrored_variance / pairs.mirrored**2).mean(1)[use] / 3 / max(4 * np.pi * smooth**2, 1.0)
-    weight = 1 / (noise + (FLOOR_PX * steep) ** 2 + FLOOR_LOG**2)
+    weight = 1 / (noise + FLOOR_PX**2 * (steep**2).sum(1) + FLOOR_LOG**2)
     block = (row[use] // BLOCK_PX) * 100_000 + column[use] // BLOCK_PX
     return Equations(
-        sharp(real - model), np.stack(columns, -1), np.stack([sharp(grid(moved[:, k])) for k in range(3, 9)], -1),
-        steep, weight, np.unique(block, return_inverse=True)[1],
+        left, np.stack(columns, -1), np.stack([sharp(grid(moved[:, k])) for k in range(3, 9)], -1),
+        steep, weight, np.unique(block, return_inverse=True)[1], free,
     )  # fmt: skip
 
 
 def _smoothed(values: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian mean (H, W) of the known values, zero where nothing is."""
-    return _blurred(values * known, sigma) / np.maximum(_blurred(known, sigma), 1e-6) * known
-
-
-def _blurred(values: np.ndarray, sigma: float) -> np.ndarray:
-    """Gaussian mean (H, W), zero outside."""
-    from scipy.ndimage import gaussian_filter
-
-    return np.asarray(gaussian_filter(values, sigma, truncate=3, mode="constant"))
+    return windowed(values * known, sigma) / np.maximum(windowed(known, sigma), 1e-6) * known
 
 
 def _shrunk(inside: np.ndarray, pixels: int) -> np.ndarray:
@@ -269,5 +276,25 @@ def solve(
     known = held.copy()
     known[3, 3] = 0  # the blur's is an opinion
     covariance = spread + inverse @ known @ inverse + lever @ pose @ lever.T
-    left = float(np.sqrt((weight * over**2).sum() / (weight * equations.slope**2).sum()))
-    return solved, covariance, left, blocks
+    return solved, covariance, left_px(equations, over, weight), blocks
+
+
+def left_px(equations: Equations, over: np.ndarray, weight: np.ndarray) -> float:
+    """What is left ``over`` (N,) as a shift [px]: all of it over the slopes; with free contrast the blocks' shifts.
+
+    A block's residual is projected on its slopes along x and y; what they take up by chance, two degrees of freedom of
+    the rest's scatter, is subtracted.
+    """
+    slope = equations.slope
+    steep = float((weight[:, None] * slope**2).sum())
+    if not equations.free:
+        return float(np.sqrt((weight * over**2).sum() / steep))
+    pixels = np.bincount(equations.block)
+    normal, pull = np.zeros((len(pixels), 2, 2)), np.zeros((len(pixels), 2))
+    np.add.at(normal, equations.block, weight[:, None, None] * slope[:, :, None] * slope[:, None])
+    np.add.at(pull, equations.block, (weight * over)[:, None] * slope)
+    shift = np.linalg.solve(normal + 1e-9 * steep * np.eye(2), pull[..., None])[..., 0]
+    taken = (shift * pull).sum(1)
+    rest = np.bincount(equations.block, weight * over**2) - taken
+    chance = 2 * rest.sum() / max(np.maximum(pixels - 2, 0).sum(), 1)
+    return float(np.sqrt(max(float(taken.sum() - len(pixels) * chance), 0.0) / steep))
