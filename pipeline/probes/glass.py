@@ -123,7 +123,7 @@ def unghosted(
 
     height, width = seen.shape
     known = np.isfinite(sine) & (seen > 0)
-    safe = np.where(known, np.nan_to_num(sine), 0.0)
+    safe = np.where(known, sine, 0.0)
     w = latlong_directions(height, width)
     cosine = -(w @ away)
     spoke = w + cosine[..., None] * away

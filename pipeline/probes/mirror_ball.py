@@ -8,6 +8,7 @@ Limits: other light is taken as distant, so things at distance d are displaced b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
 from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, refuse_cut, solve_radius
 from pipeline.probes.glass import MOST, Glass, unghosted
-from pipeline.probes.glass_thickness import GlassEvidence, judge, thickness
+from pipeline.probes.glass_thickness import GlassEvidence, glimpse, judge, thickness, worth_measuring
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
 from pipeline.probes.observation import Grid, Observation, Quality, Shots, ViewMap
 from pipeline.probes.outline import part_of
@@ -66,7 +67,8 @@ class MirrorBall:
             found[name], anchors[name] = anchored(
                 found[name], photographs[name], shots.camera_of(name), views[name], radius, stated
             )
-        glassy = glass_of(shots, by_rim, radius, stated)
+        fronts = {name: found[name].fit.centre for name, anchor in anchors.items() if stated is None and anchor["used"]}
+        glassy = glass_of(shots, by_rim, radius, stated, fronts)
         for name in names:
             if glassy.glass is not stated:
                 found[name], anchors[name] = anchored(
@@ -129,24 +131,43 @@ def stated_glass(facts: dict[str, Any], radius: float) -> Glass | None:
     return Glass(share) if share > 0 else None
 
 
-def glass_of(shots: Shots, by_rim: dict[str, Found], radius: float, stated: Glass | None) -> GlassEvidence:
+def glass_of(
+    shots: Shots, by_rim: dict[str, Found], radius: float, stated: Glass | None, fronts: dict[str, np.ndarray]
+) -> GlassEvidence:  # fmt: skip
     """What is known of the ball's glass: stated, or measured by the plane that the views mirror.
 
-    ``by_rim``: the balls before the mirrored plane moved them. Not measured at unknown size, which the plane's mirror
-    image was used for.
+    ``by_rim``: the balls before the mirrored plane moved them; ``fronts``: centres (3,) [m], camera frame, of those
+    whose mirrored plane fits a front mirror. Where all do, and a glimpse of them shows no glass, that is what was
+    measured. Not measured at unknown size, which the plane's mirror image was used for.
     """
     facts = shots.facts["probe"]
     if facts.get("diameter_m") is None:
         return judge(stated, {}, "at unknown size the mirrored plane tells the diameter")
+    names = [name for name, ball in by_rim.items() if ball.on_plane]
+
+    def seen(name: str) -> tuple[Raster, Camera, View, sphere_fit.SphereFit, float]:
+        return shots.photographs[name], shots.camera_of(name), shots.views[name], by_rim[name].fit, radius
+
+    def glimpsed(name: str) -> tuple[float, float, float] | None:
+        return glimpse(*seen(name), fronts[name])
 
     def measured(name: str) -> tuple[float, float, float] | None:
-        fit = by_rim[name].fit
-        return thickness(shots.photographs[name], shots.camera_of(name), shots.views[name], fit, radius)
+        return thickness(*seen(name))
 
-    names = [name for name, ball in by_rim.items() if ball.on_plane]
-    with ThreadPoolExecutor() as pool:  # arrays of all rays: most of it holds no lock
-        known = {name: one for name, one in zip(names, pool.map(measured, names), strict=True) if one is not None}
+    front = set(names) <= set(fronts)
+    known = _known(names, glimpsed) if front else {}
+    if not front or worth_measuring(known):
+        known = _known(names, measured)
     return judge(stated, known, "too little texture of the plane is seen in the ball to tell", facts.get("material"))
+
+
+def _known(
+    names: list[str], measure: Callable[[str], tuple[float, float, float] | None]
+) -> dict[str, tuple[float, float, float]]:
+    """What is measured of each view, of those where it can be."""
+    with ThreadPoolExecutor() as pool:  # arrays of all rays: most of it holds no lock
+        found = list(pool.map(measure, names))
+    return {name: one for name, one in zip(names, found, strict=True) if one is not None}
 
 
 def ghosts_left(maps: dict[str, ViewMap], glass: Glass | None) -> list[str]:
@@ -249,7 +270,7 @@ def without_ghosts(
     assert surface.glass is not None
     away = mirror.rotation.T @ mirror.axis
     light, _ = unghosted(rgb, coverage, sine, away, surface.glass, surface.facing)
-    shares = surface.glass.ghosts(surface.facing, np.nan_to_num(sine))
+    shares = surface.glass.ghosts(surface.facing, np.where(np.isfinite(sine) & (coverage > 0), sine, 0.0))
     return light.astype(np.float32), (photon / (1 - shares[0] - shares[1]) ** 2).astype(np.float32)
 
 

@@ -120,11 +120,13 @@ def lookup_channels(photograph: Raster, window: tuple[slice, slice] = (slice(Non
 
     A clipped pixel's infinite variance becomes the square of its value: 100 %.
     """
-    rgb = photograph.rgb()[window]
-    variance = photograph.rgb("variance")[window]
-    clipped = photograph["mask"][window] & CLIPPED > 0
-    valid = np.isfinite(rgb).all(-1)
-    rgb = np.where(valid[..., None], rgb, 0)
-    variance = np.where(np.isfinite(variance) & valid[..., None], variance, rgb**2)
-    flags = np.stack([valid, clipped & valid], -1)
-    return np.concatenate([rgb, variance, flags], -1).astype(np.float32)
+    colours = [photograph[c][window] for c in "RGB"]  # cut before they are put together: a ball is a small part
+    valid = np.isfinite(colours).all(0)
+    found = np.empty((*valid.shape, 8), np.float32)
+    for i, (name, colour) in enumerate(zip("RGB", colours, strict=True)):
+        variance = photograph[f"variance.{name}"][window]
+        found[..., i] = np.where(valid, colour, 0)
+        found[..., 3 + i] = np.where(np.isfinite(variance) & valid, variance, np.where(valid, colour, 0) ** 2)
+    found[..., 6] = valid
+    found[..., 7] = (photograph["mask"][window] & CLIPPED > 0) & valid
+    return found
