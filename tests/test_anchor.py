@@ -108,9 +108,7 @@ def test_gloss_beside_print_changes_contrast_and_moves_nothing(varnished, off_px
     assert numbers["left_with_its_contrast_px"] == as_is.left_px
     error = found.fit.centre - transform_points(invert_rigid(POSE), CENTRE)
     assert error @ np.linalg.solve(found.fit.covariance, error) < 11.3  # 99 %
-    assert across_px(found) < 0.5 * across_px(
-        start
-    )  # 0.22 and 0.31; an image with its contrast is off by 1.3 and 1.9 px
+    assert across_px(found) < 0.5 * across_px(start)  # 0.22, 0.31; an image with its contrast is off by 1.3, 1.9 px
     sure = replace(ball((2.5, 0.0)), fit=replace(ball((2.5, 0.0)).fit, covariance=1e-2 * SIGMA))
     assert not anchored(sure, varnished, CAMERA, VIEW, RADIUS)[1]["used"]  # against a sure rim it is not believed
 
