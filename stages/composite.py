@@ -21,6 +21,7 @@ from pipeline.run.errors import ArtifactError
 from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
+from pipeline.transport.ray_arrays import hidden_by
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, View
 from stages import knobs
 
@@ -111,21 +112,6 @@ def unseen_albedo(
         unseen[asked[hidden_by(proxies, view.world_from_camera[:3, 3], points[asked])]] = False
         result[row, column] = unseen
     return result
-
-
-def hidden_by(proxies: list[Proxy], eye: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether a face of a proxy stands between the eye (3,) and points (N, 3) (Moeller, Trumbore 1997)."""
-    hidden = np.zeros(len(points), bool)
-    rays = points - eye
-    for corners in np.concatenate([p.vertices_m[p.faces] for p in proxies] or [np.zeros((0, 3, 3))]):
-        first, one, two = corners[0], corners[1] - corners[0], corners[2] - corners[0]
-        across = np.cross(rays, two)
-        with np.errstate(divide="ignore", invalid="ignore"):  # along the face: no hit
-            inverse = 1 / (across @ one)
-            u, aside = (across @ (eye - first)) * inverse, np.cross(eye - first, one)
-            v, distance = (rays @ aside) * inverse, (two @ aside) * inverse
-        hidden |= (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0) & (distance < 1 - 1e-6)
-    return hidden
 
 
 def group_layers(change: d.Change, rule: d.Rule, layers: Raster, mask: np.ndarray | None) -> dict[str, d.Layers]:

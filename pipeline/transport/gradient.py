@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.camera.lens import pixel_rays
 from pipeline.conventions import CLIPPED
-from pipeline.transport.patches import arrays_of_rays
+from pipeline.transport.ray_arrays import arrays_of_rays
 from pipeline.transport.reflectance import linear
 from pipeline.transport.scene import environment_emitter, ground_shape, ground_texture, proxy_shape
 from pipeline.types import Camera, Occluder, Plane, Proxy, Raster, View
@@ -79,7 +79,7 @@ def fit(
     ``start`` (H, W, 3): the plane's albedo to begin with; proxies begin with theirs. Where no pixel asks for a change
     the factor stays 1. The answer is the mean over the last quarter of ``steps``.
     """
-    mi = arrays_of_rays("gradients")
+    mi = arrays_of_rays("reflectance: gradients")
     import drjit as dr
 
     albedos = [np.full(3, 0.5) if proxy.albedo is None else np.asarray(proxy.albedo) for proxy in proxies]

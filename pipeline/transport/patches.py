@@ -15,10 +15,9 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.environment import irradiance, resize_environment
-from pipeline.run.errors import ToolError
+from pipeline.transport.ray_arrays import arrays_of_rays, batches, clear, rays_along
 from pipeline.transport.reflectance import linear
 from pipeline.transport.scene import ground_shape, proxy_shape
-from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Occluder, Plane, Proxy
 
 CELLS = 24  # along the longer side of the rectangle
@@ -30,7 +29,6 @@ MAP = (32, 64)  # coarsest grid of the distant light
 FINEST = 256  # rows of the distant light's finest grid: 0.7 degrees
 SPLIT_SHARE = 0.004  # of the map's irradiance: a texel that holds more is split
 STRONG_SHARE = 0.01  # of the plane's irradiance: a light that holds more casts edges worth tracing at every texel
-RAYS = 1 << 21  # per batch
 CLEARANCE = 2e-5  # of the scene's size, between a ray's start and its surface
 
 
@@ -80,7 +78,7 @@ class Geometry:
     """The surfaces of the local scene, ready for rays from numpy arrays."""
 
     def __init__(self, plane: Plane, proxies: Sequence[Proxy], occluders: Sequence[Occluder] = ()) -> None:
-        self.mi = arrays_of_rays("proxies and occluders")
+        self.mi = arrays_of_rays("reflectance: proxies and occluders")
         side = np.linalg.norm(plane.corners_m[[1, 3]] - plane.corners_m[0], axis=1)
         size = side.max() / CELLS
         fine = subdivided(proxies, size)
@@ -96,12 +94,7 @@ class Geometry:
 
     def clear(self, start: np.ndarray, direction: np.ndarray, reach: np.ndarray | float = np.inf) -> np.ndarray:
         """Whether rays from ``start`` (N, 3) along unit ``direction`` (N, 3) meet nothing within ``reach``: (N,)."""
-        reach = np.broadcast_to(np.minimum(reach, 1e30), len(start))
-        found = [
-            ~np.array(self.scene.ray_test(self._rays(start[part], direction[part], reach[part])), bool)
-            for part in batches(len(start))
-        ]
-        return np.concatenate(found) if found else np.zeros(0, bool)
+        return clear(self.mi, self.scene, start, direction, reach)
 
     def sees(self, points: np.ndarray, ways: np.ndarray) -> np.ndarray:
         """Which distant directions ``ways`` (M, 3) are open from ``points`` (P, 3): (P, M) bool."""
@@ -113,7 +106,7 @@ class Geometry:
         patch, back = np.full(len(start), -1), np.zeros(len(start), bool)
         rows, columns = self.patches.grid
         for part in batches(len(start)):
-            hit = self.scene.ray_intersect(self._rays(start[part], direction[part], np.full(len(start[part]), 1e30)))
+            hit = self.scene.ray_intersect(rays_along(self.mi, start[part], direction[part], np.inf))
             uv, prim = np.array(hit.uv).reshape(2, -1), np.array(hit.prim_index).astype(int)
             found = np.full(len(start[part]), -1)
             for number, shape in enumerate(self.shapes):
@@ -129,29 +122,6 @@ class Geometry:
             normal = self.patches.normal[np.maximum(found, 0)]
             back[part] = (found >= 0) & ((normal * direction[part]).sum(1) > 0)
         return patch, back
-
-    def _rays(self, start: np.ndarray, direction: np.ndarray, reach: np.ndarray) -> Any:
-        vectors = [np.ascontiguousarray(a.T, np.float32) for a in (start, direction)]
-        return self.mi.Ray3f(
-            self.mi.Point3f(vectors[0]),
-            self.mi.Vector3f(vectors[1]),
-            self.mi.Float(np.asarray(reach, np.float32)),
-            0.0,
-            [],
-        )
-
-
-def arrays_of_rays(what: str) -> Any:
-    """The mitsuba module, for code that traces arrays. Raises ToolError where only the scalar variant loads."""
-    mi = use_mitsuba()
-    if mi.variant().startswith("scalar"):
-        raise ToolError(f"reflectance: {what} need LLVM or CUDA, found only {mi.variant()}; run insitu doctor")
-    return mi
-
-
-def batches(count: int) -> list[slice]:
-    """Slices of at most ``RAYS`` that cover ``count``."""
-    return [slice(i, min(i + RAYS, count)) for i in range(0, count, RAYS)]
 
 
 def golden(count: int, dimensions: int) -> np.ndarray:
@@ -279,7 +249,7 @@ def direct_irradiance(geometry: Geometry, environment: np.ndarray, lights: Light
     for number, normal in enumerate(normals):
         ways, flux = upper(lights, normal)
         patch, point = np.nonzero((kind.ravel() == number)[:, None] & ~buried)
-        for part in (slice(i, i + max(1, RAYS // len(ways))) for i in range(0, len(patch), max(1, RAYS // len(ways)))):
+        for part in batches(len(patch), len(ways)):
             seen = geometry.sees(start[patch[part], point[part]], ways)
             np.add.at(arriving, patch[part], seen @ flux)
             np.add.at(unhidden, patch[part], flux.sum(0))
@@ -307,7 +277,7 @@ def point_light(
     ways, flux = upper(lights, normal)
     direct, bounced = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
     free = np.flatnonzero(~buried)
-    for part in (free[i : i + max(1, RAYS // len(ways))] for i in range(0, len(free), max(1, RAYS // len(ways)))):
+    for part in (free[some] for some in batches(len(free), len(ways))):
         direct[part] = light * (geometry.sees(start[part], ways) @ flux) / flux.sum(0)
     numbers = golden(len(free) * FINAL_GATHER, 2).reshape(len(free), FINAL_GATHER, 2)
     direction = _cosine(np.tile(normal, (len(free), 1)), numbers[..., 0], numbers[..., 1])
