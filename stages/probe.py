@@ -66,7 +66,7 @@ def compute(
         raise CaptureError(
             f"room: the probe, at {np.round(centre, 2).tolist()} m, lies outside; correct centre_m, size_m"
         )
-    near = near_field.assess(rgb, centre, near_field.places_of(wishes, centre[1]), room, params.near_budget)
+    near = near_field.assess(rgb, centre, near_field.places_of(wishes, centre[1]), room, params.near_budget, eye[:3, 3])
     recovered = lamps.recovered
     if room and near.target is not None:
         maps_of = [rgb, variance, np.stack([seen, over, recovered], -1)]

@@ -31,6 +31,11 @@ def numbers(out: Path, stage: str) -> dict[str, Any]:
     return json.loads((out / stage / "record.json").read_text())["numbers"]
 
 
+def evidence_of(out: Path, stage: str, term: str) -> dict[str, Any]:
+    rows = json.loads((out / stage / "record.json").read_text())["evidence"]
+    return next(row for row in rows if row["term"] == term)
+
+
 def forced(out: Path, name: str, change: Any, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Metrics of a build with an artifact replaced by what ``change`` makes of all values; the rest computed again."""
     build = built(out)
@@ -119,18 +124,21 @@ def test_what_does_not_fit_the_lacquer_is_said(lacquer_build):
 
 @pytest.mark.slow
 def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
-    """Forced to a diffuse ground. Measured: objects 0.055 -> 0.088, shadows 0.093 -> 0.276.
+    """Forced to a diffuse ground. Predicted: 34 % of the shadows' change.
 
-    The evidence names what could be lost (mirror images of the objects in the ground) and puts no figure on it.
+    Measured: error of the shadows' change 0.071 -> 0.273, on the objects 0.058 -> 0.088; they mirror the
+    ground, of which the plate shows what it is.
     """
     from stages import reflectance
 
     matt = Surface(scores=[{"model": "diffuse", "because": "forced"}])
     monkeypatch.setattr(reflectance, "climb", lambda *_: matt)
+    predicted = evidence_of(lacquer_build, "reflectance", "specular lobe of the ground")["bound_rel"]
     before = json.loads((lacquer_build / "evaluate/metrics.json").read_text())
     after = forced(lacquer_build, "plane", lambda values: values["plane"], monkeypatch)
+    assert predicted > 0.2
+    assert after["shadow_change_err"] - before["shadow_change_err"] > predicted / 2
     assert after["object_rel_err"] > 1.3 * before["object_rel_err"]
-    assert after["shadow_change_err"] > 2 * before["shadow_change_err"]
 
 
 # ---------------------------------------------------------------- cellar: lamps nearby, a shaking hand, labels that lie
@@ -138,10 +146,10 @@ def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
 
 @pytest.mark.slow
 def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_cost(cellar_build, monkeypatch):
-    """Forced off: the map as the ball saw it, 0.3 m away. Predicted: 37 % of the irradiance, 6 % left.
+    """Forced off: the map as the ball saw it, 0.3 m away. Predicted: 17 % of the light on what objects show the camera,
+    27 % of that on the plane; 6 % is left on the worst of six sides.
 
-    Measured: error of the shadows' change 0.062 -> 0.310, on the objects 0.046 -> 0.154: the figure is of the axis that
-    suffers most, which the ground faces and few of their pixels.
+    Measured: error on the objects 0.046 -> 0.154, of the shadows' change 0.062 -> 0.310.
     """
     found = numbers(cellar_build, "probe")
     assert found["near_irradiance_error"] > 5 * KNOBS["probe"]().near_budget
@@ -154,8 +162,8 @@ def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_
 
     before = json.loads((cellar_build / "evaluate/metrics.json").read_text())
     after = forced(cellar_build, "environment", unmoved, monkeypatch)
-    assert after["shadow_change_err"] - before["shadow_change_err"] > found["near_irradiance_error"] / 2
-    assert after["object_rel_err"] > 2 * before["object_rel_err"]
+    assert after["object_rel_err"] - before["object_rel_err"] > found["near_object_error"] / 2
+    assert after["shadow_change_err"] - before["shadow_change_err"] > found["near_plane_error"] / 2
 
 
 @pytest.mark.slow

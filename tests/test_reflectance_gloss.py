@@ -103,3 +103,22 @@ def test_too_few_cells_stay_diffuse():
     surface = specular.climb(cells, LAMP, np.array([0.0, 1, 0]))
     assert surface.model == "diffuse"
     assert not specular.explain(surface)["modelled"]
+
+
+def test_what_a_gloss_taken_for_matt_costs_grows_with_it_and_leaves_out_other_materials():
+    """The lobe of a plane that is what the model says; of a third that is another material little is heard."""
+    view = np.stack([np.sin(a := np.linspace(0.2, 1.2, 60)), np.cos(a), 0 * a], -1)
+    lights, up = lights_of(LAMP), np.array([0.0, 1, 0])
+    found = specular.lobes(lights, up, view, np.array([0.4]))
+
+    def cost(f0: float, others: slice = slice(0)) -> float:
+        fields = specular.rough(found, np.array([f0]))
+        radiance = 0.4 * fields.scale[0] + fields.offset[0]
+        radiance[others] *= 6  # paper on the plane
+        cells = specular.Cells(radiance, 1e-6 * radiance**2, view, np.arange(60))
+        return specular.taken_for_matt(cells, LAMP, up, {"model": "rough", "roughness": 0.4, "f0": f0})
+
+    costs = [cost(f0) for f0 in (0.01, 0.03, 0.09)]
+    assert costs[0] < costs[1] < costs[2]
+    assert costs[0] < 0.1
+    assert cost(0.03, others=slice(0, None, 3)) < costs[1]

@@ -24,6 +24,8 @@ from pipeline.light.environment import AXES, irradiance, resize_environment
 PREDICTION_ROWS = 64  # rows of the map on which errors are predicted
 ASSUMED_M = (1.0, 2.0, 4.0)  # distances for which the error is stated when none is known
 WORTH = 0.75  # of the error: what is left at the centroid must be less, or nothing is moved
+NORMALS = 96  # of a ball, on which light is compared; half of them face the camera
+UP = 2  # of AXES
 SPLIT = 3  # samples per texel and axis; more where the new place looks at the old map from afar
 
 VALID, MEASURED = "insitu:valid_at_m", "insitu:measured_at_m"  # attributes of the map
@@ -103,15 +105,36 @@ def _compression(depth: Depth, source: np.ndarray, target: np.ndarray) -> float:
     return float((far / np.maximum(near, 1e-9)).max())
 
 
-def irradiance_error(rgb: np.ndarray, depth: Depth, source: np.ndarray, used: np.ndarray, target: np.ndarray) -> float:
-    """Largest relative error over the six axes of the irradiance at ``target`` (3,), when the map of ``used`` serves.
+def irradiance_errors(
+    rgb: np.ndarray, depth: Depth, source: np.ndarray, used: np.ndarray, target: np.ndarray, normals: np.ndarray = AXES
+) -> np.ndarray:
+    """Relative errors (N,) of the irradiance of ``normals`` (N, 3) at ``target`` (3,), when the map of ``used`` serves.
 
     ``rgb`` (H, W, 3) is valid at ``source``; ``used`` (3,) is where it was brought to.
     """
     rows = min(PREDICTION_ROWS, rgb.shape[0])
     small = resize_environment(rgb, rows, 2 * rows)
-    found, true = (irradiance(relocate([small], depth, source, place)[0], AXES) for place in (used, target))
-    return float((np.linalg.norm(found - true, axis=1) / np.maximum(np.linalg.norm(true, axis=1), 1e-300)).max())
+    found, true = (irradiance(relocate([small], depth, source, place)[0], normals) for place in (used, target))
+    return np.asarray(np.linalg.norm(found - true, axis=1) / np.maximum(np.linalg.norm(true, axis=1), 1e-300))
+
+
+def error_on_objects(rgb: np.ndarray, depth: Depth, source: np.ndarray, target: np.ndarray, eye: np.ndarray) -> float:
+    """Mean of these errors, unmoved, over what a ball at ``target`` shows a camera at ``eye`` (3,), by size there."""
+    normals, seen = _facing(eye - target)
+    return float(irradiance_errors(rgb, depth, source, source, target, normals) @ seen)
+
+
+def _facing(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (N, 3) that a ball shows from direction ``way`` (3,), and shares (N,) of its picture; evenly spread.
+
+    A spiral over the sphere (Swinbank and Purser 2006, Fibonacci grids), of which half is seen.
+    """
+    number = np.arange(NORMALS) + 0.5
+    height, turn = 1 - 2 * number / NORMALS, np.pi * (1 + np.sqrt(5)) * number
+    radius = np.sqrt(1 - height**2)
+    every = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], -1)
+    cosine = every @ way / np.linalg.norm(way)
+    return every[cosine > 0], cosine[cosine > 0] / cosine[cosine > 0].sum()
 
 
 @dataclass(frozen=True)
@@ -125,49 +148,58 @@ class Assessment:
 
 
 def assess(
-    rgb: np.ndarray, source: np.ndarray, objects: Sequence[np.ndarray], room: Room | None, budget: float
-) -> Assessment:
+    rgb: np.ndarray, source: np.ndarray, objects: Sequence[np.ndarray], room: Room | None, budget: float,
+    eye: np.ndarray,
+) -> Assessment:  # fmt: skip
     """Error of the map of ``source`` (3,) at the ``objects`` [(3,)], and whether it exceeds the ``budget``.
 
     With a room the error is predicted, and cured at the objects' centroid when it is too large and that helps. Without,
-    it is stated for the farthest object and walls all around at 1, 2 and 4 m.
+    it is stated for the farthest object and walls all around at 1, 2 and 4 m. ``eye`` (3,): the plate's camera.
     """
     if not objects:
-        return Assessment(None, {}, [], _reason(False, "no objects are placed", "nothing"))
+        return Assessment(None, {}, [], _reason(False, "no objects are placed", "nothing", 0.0))
     farthest = max(objects, key=lambda place: float(np.linalg.norm(place - source)))
     offset = float(np.linalg.norm(farthest - source))
     numbers: dict[str, Any] = {"near_offset_m": offset, "near_depth": "unknown" if room is None else "room"}
     if room is None:
         known = {
-            d: irradiance_error(rgb, sphere(source, d), source, source, farthest) for d in ASSUMED_M if offset < 0.9 * d
+            d: float(irradiance_errors(rgb, sphere(source, d), source, source, farthest).max())
+            for d in ASSUMED_M
+            if offset < 0.9 * d
         }
         numbers["near_irradiance_error_if_walls_at"] = {f"{d:g}_m": error for d, error in known.items()}
         listed = ", ".join(f"{error:.1%} for walls at {d:g} m" for d, error in known.items()) or "offset beyond 4 m"
         cost = f"of irradiance, objects up to {offset:.2f} m from the probe: {listed}"
-        return Assessment(None, numbers, [], _reason(False, "no [room]: distances are not known", cost))
+        because = "no [room]: distances are not known"
+        return Assessment(None, numbers, [], _reason(False, because, cost, max(known.values(), default=None)))
     outside = [place for place in objects if not room.holds(place)]
     if outside:
         listed = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in outside)
         warning = f"room: objects at {listed} m lie outside its walls; the map is left at the probe"
         cost = f"unknown, objects up to {offset:.2f} m from the probe"
-        return Assessment(None, numbers, [warning], _reason(False, "objects lie outside the room", cost))
+        return Assessment(None, numbers, [warning], _reason(False, "objects lie outside the room", cost, None))
     target = np.mean(objects, 0)
-    error = max(irradiance_error(rgb, room.depth, source, source, place) for place in objects)
-    numbers["near_irradiance_error"] = error
+    at = np.array([irradiance_errors(rgb, room.depth, source, source, place) for place in objects])
+    error, plane = float(at.max()), float(at[:, UP].max())
+    shown = max(error_on_objects(rgb, room.depth, source, place, eye) for place in objects)
+    numbers |= {"near_irradiance_error": error, "near_plane_error": plane, "near_object_error": shown}
+    cost = (
+        f"{shown:.1%} of the light on what objects show, {plane:.1%} of it on the plane, {error:.1%} on the worst side"
+    )
     needed = error > budget
     because = f"predicted through the room: {error:.2%} of irradiance at {offset:.2f} m; budget {budget:.2%}"
     if not needed:
-        return Assessment(None, numbers, [], _reason(False, because, f"{error:.2%} of irradiance"))
-    left = max(irradiance_error(rgb, room.depth, source, target, place) for place in objects)
+        return Assessment(None, numbers, [], _reason(False, because, cost, error))
+    left = max(float(irradiance_errors(rgb, room.depth, source, target, place).max()) for place in objects)
     numbers["near_irradiance_error_left"] = left
     if left > WORTH * error:
         because += f"; {left:.2%} would be left at their centroid: they stand around the probe, no one place serves all"
         warning = (
             f"near field: the light at the objects differs by {error:.1%} from that at the probe, on every side of it"
         )
-        return Assessment(None, numbers, [warning], _reason(False, because, f"{error:.2%} of irradiance"))
-    cost = f"{error:.2%} of irradiance; {left:.2%} is left between the objects, and the error of the room's measures"
-    return Assessment(target, numbers, [], _reason(True, because, cost))
+        return Assessment(None, numbers, [warning], _reason(False, because, cost, error))
+    cost += f"; {left:.2%} is left between the objects, and the error of the room's measures"
+    return Assessment(target, numbers, [], _reason(True, because, cost, error))
 
 
 def room_of(facts: dict[str, Any]) -> Room | None:
@@ -206,7 +238,8 @@ def places(valid: np.ndarray, measured: np.ndarray) -> dict[str, str]:
     return {VALID: " ".join(map(repr, valid.tolist())), MEASURED: " ".join(map(repr, measured.tolist()))}
 
 
-def _reason(modelled: bool, because: str, cost: str) -> dict[str, Any]:
+def _reason(modelled: bool, because: str, cost: str, bound: float | None) -> dict[str, Any]:
     return {
-        "term": "near field: the map at the objects", "modelled": modelled, "because": because, "could_cost": cost
+        "term": "near field: the map at the objects", "modelled": modelled, "because": because, "could_cost": cost,
+        "bound_rel": bound,
     }  # fmt: skip

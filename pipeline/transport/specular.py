@@ -34,6 +34,9 @@ F0 = np.array([0.02, 0.03, 0.04, 0.05, 0.065, 0.085, 0.12])
 FINER = 9  # values of roughness and of f0 between two of the ladder's
 FINE_MAP = (64, 128)  # texels of the map once a rung is taken
 GRID = 48  # points along a side where the lobe is computed for the texture
+HIDDEN_DEG = (30.0, 30.0)  # elevation and half angle of what a thing hides of the sky: it stands on the ground nearby
+AZIMUTHS = 12  # from which it is asked what it would hide
+SHADOW = 0.05  # of the radiance: a change that counts
 MIN_CELLS = 48
 MIN_GAIN = 5.0  # nats over all held-out cells
 MIN_SIGMAS = 2.5  # of the sum over blocks
@@ -185,10 +188,57 @@ def climb(cells: Cells, environment: np.ndarray, normal: np.ndarray) -> Surface:
         rows[number] |= {"against": against, "gain": gain, "sigmas": sigmas}
         if gain > MIN_GAIN and sigmas > MIN_SIGMAS:
             taken = number
+    asked = rows[taken or 1]
+    if np.isfinite(asked["gain"]):
+        asked["taken_for_matt"] = taken_for_matt(cells, environment, normal, asked)
     model: dict[str, Any] = {key: value for key, value in rows[taken].items() if key in Surface.model_fields}
     if taken:
         model |= refined(cells, environment, normal, model)
     return Surface(**model, scores=[{**row, "cells": len(fold)} for row in rows])
+
+
+def taken_for_matt(cells: Cells, environment: np.ndarray, normal: np.ndarray, model: dict[str, Any]) -> float:
+    """By how much shadows would be wrong if a glossy plane were taken for a matt one: a share of their change, median.
+
+    From each of AZIMUTHS sides a thing hides a cap of the sky. The glossy plane loses ``base dW + dS`` of its radiance
+    L there, the matt one ``L dE / E``. Pooled are all cells and sides where that changes L by more than SHADOW; a cell
+    counts by its weight in the t distribution of bases, so that what is of another material has little say.
+    """
+    lights = lights_of(environment)
+    roughness, f0 = np.array([model["roughness"]]), np.array([model.get("f0", F0[0])])
+
+    def fields(part: Lights) -> tuple[Fields, np.ndarray]:
+        found = lobes(part, normal, cells.view, roughness)
+        return metal(found) if model["model"] == "metallic" else rough(found, f0), found.e
+
+    whole, light = fields(lights)
+    scale = np.maximum(whole.scale, 1e-12)
+    base = (cells.radiance - whole.offset) / scale
+    mean, scatter = fitted(base, cells.noise / scale**2)
+    ours = np.minimum((FREEDOM + 3) / (FREEDOM + _distance(base - mean[:, None], scatter)[0]), 1.0)
+    level = np.linalg.norm(cells.radiance, axis=1)
+    elevation, half = np.radians(HIDDEN_DEG)
+    side, other = _across(normal)
+    wrong = [np.zeros(0)]
+    for azimuth in np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS:
+        flat = np.cos(azimuth) * side + np.sin(azimuth) * other
+        way = np.cos(elevation) * flat + np.sin(elevation) * normal
+        hidden = lights.direction @ way > np.cos(half)
+        lost, dark = fields(Lights(lights.direction[hidden], lights.power[hidden]))
+        glossy = np.maximum(base[0], 0) * lost.scale[0] + lost.offset[0]
+        matt = cells.radiance * dark / np.maximum(light, 1e-12)
+        change = np.linalg.norm(glossy, axis=1)
+        counts = change > SHADOW * level
+        wrong.append((ours * np.linalg.norm(matt - glossy, axis=1))[counts] / change[counts])
+    pooled = np.concatenate(wrong)
+    return float(np.median(pooled)) if len(pooled) else 0.0
+
+
+def _across(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) that make a right angle with a unit normal and each other."""
+    side = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    side = side / np.linalg.norm(side)
+    return side, np.cross(normal, side)
 
 
 def _named(name: str, candidate: int, roughness: np.ndarray, f0: np.ndarray) -> dict[str, Any]:
@@ -285,9 +335,15 @@ def explain(surface: Surface) -> dict[str, Any]:
         for row in surface.scores
         if "gain" in row
     )
+    modelled = surface.model != "diffuse"
+    wrong = next((row["taken_for_matt"] for row in surface.scores if "taken_for_matt" in row), None)
+    cost = "mirror images of the objects in the ground, and shadows that lie differently on a gloss"
+    if wrong is not None:
+        cost += f": {wrong:.1%} of their change" + ("" if modelled else ", if the likeliest gloss were there")
     return {
         "term": "specular lobe of the ground",
-        "modelled": surface.model != "diffuse",
+        "modelled": modelled,
         "because": f"held-out log-likelihood: {scores}" if scores else surface.scores[0]["because"],
-        "could_cost": "a gloss fainter than the texture shows is missed: no mirror image of the objects in the ground",
+        "could_cost": cost,
+        "bound_rel": wrong,
     }
