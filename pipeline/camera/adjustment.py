@@ -6,13 +6,14 @@ of the lens's numbers are free is a matrix, so that one focal length for both ax
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.camera.distortion import TERMS, model_of
-from pipeline.camera.resection import residuals_and_jacobian
-from pipeline.camera.rigid import perturb
+from pipeline.camera.lens import project_jacobians
+from pipeline.camera.rigid import camera_points, perturb
 from pipeline.run.errors import NumericalError
 from pipeline.types import Camera
 
@@ -94,8 +95,7 @@ def _normal_equations(
     lens_lens = np.zeros((free.shape[1], free.shape[1]))
     lens_gradient = np.zeros(free.shape[1])
     cross, pose_pose, pose_gradient, cost = [], [], [], 0.0
-    for pose, points, seen in zip(poses, world_m, px, strict=True):
-        residuals, by_pose, by_lens = residuals_and_jacobian(camera, pose, points, seen)
+    for residuals, by_pose, by_lens in _linearised(camera, poses, world_m, px):
         flat, lens, r = by_pose.reshape(-1, 6), np.concatenate(by_lens) @ free, residuals.ravel()
         lens_lens += lens.T @ lens
         lens_gradient += lens.T @ r
@@ -104,6 +104,19 @@ def _normal_equations(
         pose_gradient.append(flat.T @ r)
         cost += float(r @ r)
     return lens_lens, cross, pose_pose, (lens_gradient, pose_gradient), cost if np.isfinite(cost) else np.inf
+
+
+def _linearised(
+    camera: Camera, poses: list[np.ndarray], world_m: list[np.ndarray], px: list[np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """`residuals_and_jacobian` of each photograph; the lens is asked once for all, as each is a few dozen points."""
+    placed = [camera_points(pose, points) for pose, points in zip(poses, world_m, strict=True)]
+    predicted, by_point, by_lens = project_jacobians(camera, np.concatenate([points for points, _ in placed]))
+    by_pose = by_point @ np.concatenate([derivative for _, derivative in placed])
+    end = 0
+    for seen in px:
+        start, end = end, end + len(seen)
+        yield seen - predicted[start:end], by_pose[start:end], by_lens[start:end]
 
 
 def _damped(block: np.ndarray, damping: float) -> np.ndarray:
@@ -145,7 +158,7 @@ def _finish(
             f"calibrate: no lens of the {model_of(camera.distortion)} model images all corners of {len(poses)} board "
             "photographs, needed one that does; check squares and square_m of [board]"
         )
-    residuals = [residuals_and_jacobian(camera, *item)[0] for item in zip(poses, world_m, px, strict=True)]
+    residuals = [item[0] for item in _linearised(camera, poses, world_m, px)]
     reduced = lens_lens - sum(c @ np.linalg.solve(p, c.T) for c, p in zip(cross, pose_pose, strict=True))
     scale = np.sqrt(np.maximum(np.diag(lens_lens), 1e-300))
     scaled = reduced / np.outer(scale, scale)

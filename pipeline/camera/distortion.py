@@ -58,9 +58,11 @@ def _fold(k: tuple[float, ...]) -> float:
         return float(np.tan(min(angle, WIDEST_RAD)) ** 2)
     if len(k) == 5:
         return _first_root([7 * k[4], 5 * k[1], 3 * k[0], 1.0])
-    above, below = np.poly1d([k[4], k[1], k[0], 1.0]), np.poly1d([k[7], k[6], k[5], 1.0])
-    turn = above * below + np.poly1d([2.0, 0]) * (above.deriv() * below - above * below.deriv())
-    return min(_first_root(turn.coeffs), _first_root(below.coeffs))
+    above, below = np.array([k[4], k[1], k[0], 1.0]), np.array([k[7], k[6], k[5], 1.0])
+    power = np.array([3.0, 2.0, 1.0])  # of the derivatives, the constants left out
+    growth = np.convolve(power * above[:3], below) - np.convolve(above, power * below[:3])
+    turn = np.convolve(above, below) + np.append(2 * growth, 0.0)
+    return min(_first_root(turn), _first_root(below))
 
 
 def _first_root(coefficients: object) -> float:
