@@ -16,7 +16,7 @@ from pipeline.probes import ball_surface
 from pipeline.probes.ball_evidence import find_dirt, unbinned, without
 from pipeline.probes.ball_pairs import Pairs, Sight, ball_points, neighbourhood, plane_pairs
 from pipeline.probes.ball_shape import dents, patch_shifts
-from pipeline.probes.ball_surface import Measured, Surface, decide, measure
+from pipeline.probes.ball_surface import GIVEN_SIGMA, Measured, Surface, decide, measure, under_gloss
 from pipeline.run.probe_facts import MirrorBallFacts
 from pipeline.run.strict import Metal
 from pipeline.transport.conductors import GRAZING, REFLECTANCE, preset, reflectance_at
@@ -203,6 +203,17 @@ def test_given_is_doubted_when_measured_disagrees():
     assert (surface.facing == 0.93).all()
     assert surface.sigma == pytest.approx(0.13 / 0.93, rel=1e-6)
     assert "given (0.930, 0.930, 0.930), measured (0.800, 0.800, 0.800) +- (0.003, 0.003, 0.003)" in warnings[0]
+
+
+def test_a_glossy_plane_doubts_nothing():
+    """Measured 14 to 28 % too low on a lacquered table: the given stays, and no surer or unsurer by it."""
+    found = under_gloss(finding(np.array([0.79, 0.71, 0.62])))
+    assert decide(np.array([0.92, 0.90, 0.87]), None, finding(np.array([0.79, 0.71, 0.62])))[1]
+    surface, warnings = decide(np.array([0.92, 0.90, 0.87]), None, found)
+    assert not warnings
+    np.testing.assert_allclose(surface.sigma, GIVEN_SIGMA, rtol=0.02)
+    surface, _ = decide(None, None, found)
+    assert (np.abs(surface.facing - (0.92, 0.90, 0.87)) < 2 * surface.sigma * surface.facing).all()
 
 
 def test_measured_serves_when_nothing_is_given():

@@ -11,7 +11,7 @@ from pipeline.image.colour import Space, convert
 from pipeline.probes import ball_dirt, ball_shape
 from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, neighbourhood, pixel_step, plane_pairs
 from pipeline.probes.ball_shape import Dents
-from pipeline.probes.ball_surface import Measured, Surface, decide, measure, plane_blocks
+from pipeline.probes.ball_surface import GLOSS_SIGMA, Measured, Surface, decide, measure, plane_blocks, under_gloss
 from pipeline.probes.finding import Found
 from pipeline.probes.glass import Glass
 from pipeline.probes.observation import Shots, ViewMap
@@ -32,9 +32,12 @@ class BallEvidence:
 
 
 def examine(
-    shots: Shots, found: dict[str, Found], radius: float, rim: float, glass: Glass | None = None
+    shots: Shots, found: dict[str, Found], radius: float, rim: float, glass: Glass | None = None, gloss: bool = False
 ) -> BallEvidence:  # fmt: skip
-    """The ball that was found in some views; ``rim``: outermost radius that is used, as a fraction."""
+    """The ball that was found in some views; ``rim``: outermost radius that is used, as a fraction.
+
+    ``gloss``: the plane's mirror image in the ball is known to have other contrast than the plane.
+    """
     facts = shots.facts["probe"]
     sights = {
         name: neighbourhood(
@@ -52,7 +55,13 @@ def examine(
     material = facts.get("material")
     tint = None if material is None else preset(material)[1]
     measured = measure(list(pairs.values()), tint if glass is None else glass)
+    measured = under_gloss(measured) if gloss and measured is not None else measured
     surface, warnings = decide(given, material, measured)
+    if gloss and surface.source == "measured":
+        warnings.append(
+            f"reflectance of the ball: measured from a plane that gloss changes, known to {surface.sigma.max():.0%}; give "
+            "probe.reflectance"
+        )
     surface = surface if glass is None else replace(surface, glass=glass, tint=None)
     shapes = {name: shots.photographs[name].shape for name in found}
     dented = {}
@@ -63,7 +72,7 @@ def examine(
             dented[name] = one
     dirty, spots, tested = find_dirt(sights, pairs, measured, surface, rim, shapes, warnings)
     numbers = {"reflectance": surface_numbers(surface, given, measured), "dirt": spots}
-    reasons = [*surface_reasons(surface, measured), dirt_reason(dirty, tested, measured)]
+    reasons = [*surface_reasons(surface, measured, gloss), dirt_reason(dirty, tested, measured)]
     return BallEvidence(surface, dirty, dented, numbers, warnings, reasons)
 
 
@@ -227,8 +236,8 @@ def surface_numbers(surface: Surface, given: np.ndarray | None, measured: Measur
     return numbers
 
 
-def surface_reasons(surface: Surface, measured: Measured | None) -> list[dict[str, Any]]:
-    """Which terms of the reflectance are in, and why."""
+def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = False) -> list[dict[str, Any]]:
+    """Which terms of the reflectance are in, and why; ``gloss``: of the plane, by its mirror image's contrast."""
     angle = {
         "term": "angle dependence of the ball's reflectance",
         "modelled": surface.tint is not None or surface.glass is not None,
@@ -255,7 +264,8 @@ def surface_reasons(surface: Surface, measured: Measured | None) -> list[dict[st
             "because": (
                 f"{measured.pairs} pixels of the ball show points of the plane that are seen directly, too: "
                 f"{', '.join(f'{v:.3f} +- {s:.3f}' for v, s in zip(measured.facing, measured.sigma, strict=True))}; "
-                f"used is what is {surface.source}"
+                + f"{GLOSS_SIGMA:.0%} of it for the plane's gloss, which its mirror image shows; " * gloss
+                + f"used is what is {surface.source}"
             ),
             "could_cost": "the light is off by what the stated reflectance is off",
         },

@@ -76,7 +76,8 @@ class MirrorBall:
                 )
             if not anchors[name]["used"]:
                 refuse_cut(name, found[name].fit, why=f" as {anchors[name]['why']}")
-        known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM), glassy.glass)
+        gloss = any(one["used"] and "left_with_its_contrast_px" in one for one in anchors.values())
+        known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM), glassy.glass, gloss)
         warnings += known.warnings + glassy.warnings
         maps = {
             name: view_map(
