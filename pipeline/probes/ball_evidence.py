@@ -59,7 +59,7 @@ def examine(
     surface, warnings = decide(given, material, measured)
     if gloss and surface.source == "measured":
         warnings.append(
-            f"reflectance of the ball: measured from a plane that gloss changes, known to {surface.sigma.max():.0%}; give "
+            f"reflectance of the ball: measured from a plane with gloss, known to {surface.sigma.max():.0%}; give "
             "probe.reflectance"
         )
     surface = surface if glass is None else replace(surface, glass=glass, tint=None)
