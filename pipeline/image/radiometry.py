@@ -30,7 +30,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.conventions import HOT
-from pipeline.image import machine_code, merge_kernel
+from pipeline.image import machine_code, merge_chunk, merge_kernel
 from pipeline.image.noise import Noise
 
 TILE_ROWS = 128  # even, so that a tile starts on a whole CFA cell; more than calls cost
@@ -129,10 +129,10 @@ def merge(frames: Sequence[Exposed], weights: Literal["poisson", "optimal"] = "o
     tables, limits = _coefficients(ordered), _chi2_limits(len(ordered))
     dtype = np.uint16 if all(frame.mosaic.dtype in (np.uint8, np.uint16) for frame in ordered) else np.float32
     kernel, tiles = merge_kernel.rows_kernel(), range(0, shape[0], TILE_ROWS)
-    lacking = merge_kernel.slots(len(ordered)) - len(ordered)
+    lacking = merge_chunk.slots(len(ordered)) - len(ordered)
 
     def work(share: range) -> None:
-        memory = merge_kernel.working_memory(len(ordered), 2 if len(shape) == 2 else shape[2])
+        memory = merge_chunk.working_memory(len(ordered), 2 if len(shape) == 2 else shape[2])
         for start in share:
             rows = slice(start, min(start + TILE_ROWS, shape[0]))
             out = [
@@ -181,7 +181,7 @@ def _coefficients(frames: Sequence[Exposed]) -> tuple[np.ndarray, np.ndarray, np
         bounds.append(_bounds(frame, shot, floor))
     each = np.stack([np.broadcast_to(cell, (2, *cell.shape[1:])) for cell in single], 2)  # (2, C, F, 6)
     _, dn, shot, floor, limit, weight = np.moveaxis(each, -1, 0)
-    count, lacking = len(frames), merge_kernel.slots(len(frames)) - len(frames)
+    count, lacking = len(frames), merge_chunk.slots(len(frames)) - len(frames)
     used = np.tri(count + 1, count, -1)  # (F + 1, F): of the first 0, 1, 2, ...
     parts = [np.broadcast_to(part[..., None, :], (*part.shape[:2], *used.shape)) for part in (dn, shot, floor)]
     alone = np.stack([used * (dn * weight)[..., None, :], *parts, np.broadcast_to(used, parts[0].shape)], -2)
