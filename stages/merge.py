@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.conventions import CAMERA_RGB, CLIPPED, DARK, GHOST
+from pipeline.conventions import CAMERA_RGB, CHART_VIEW, CLIPPED, DARK, FLAT_VIEW, GHOST
 from pipeline.image import (
     alignment,
     bracket_exposure,
@@ -126,6 +126,7 @@ def merge_brackets(
     numbers: dict[str, Any] = {}
     listing: dict[str, list[dict[str, Any]]] = {}
     aligned: dict[str, tuple[float, dict[str, Any]]] = {}
+    labels: dict[str, tuple[float, np.ndarray]] = {}
     for view in brackets:
         members = [i for i, name in enumerate(views) if name == view]
         exposed = [photographs.exposed(i, sensor, exposures) for i in members]
@@ -133,6 +134,8 @@ def merge_brackets(
         aligned[view] = (shift or 0.0, said)
         listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
         merged[view] = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
+        if view != CHART_VIEW and not view.startswith(FLAT_VIEW):
+            labels[view] = _label_cost(merged[view], exposed, [frames[i] for i in members])
         exposed.clear()
         photographs.release(members)
         merged[view], hot = _without_defects(merged[view], photographs.defects(members))
@@ -146,7 +149,7 @@ def merge_brackets(
     rasters = {view: raster_of(one, frames[views.index(view)], profiles[view]) for view, one in merged.items()}
     totals = {"noise": sensor.numbers, **exposures.numbers, "optical_black": photographs.black_numbers}
     totals |= {"shift_px": max((shift for shift, _ in aligned.values()), default=0.0)}
-    evidence = _evidence(sensor, exposures, aligned, numbers, patterns, warnings)
+    evidence = _evidence(sensor, exposures, aligned, numbers, patterns, labels, warnings)
     return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
 
 
@@ -301,6 +304,16 @@ def _view_numbers(merged: Merged, hot: int, frames: int) -> dict[str, Any]:
     }
 
 
+def _label_cost(merged: Merged, exposed: Sequence[Exposed], frames: Sequence[Frame]) -> tuple[float, np.ndarray]:
+    """`bracket_exposure.label_cost` of a view, large pictures from evenly spaced rows."""
+    rows = slice(None, None, max(1, merged.radiance.size // NUMBER_SAMPLES))
+    found = np.array([one.exposure for one in exposed])
+    clips = np.array([float(np.min(one.limit)) for one in exposed]) / found
+    falling = np.argsort(-clips, kind="stable")
+    labelled = np.array([exposure.exposure_of(frame) for frame in frames])
+    return bracket_exposure.label_cost(merged.radiance[rows], clips[falling], found[falling], labelled[falling])
+
+
 def _hot_limit(merged: Merged) -> float | None:
     """Share of the signal from which half of all hot photosites are found; None where none are looked for."""
     limit = radiometry.defect_limit(merged) if merged.radiance.ndim == 2 else np.inf
@@ -357,6 +370,7 @@ def _evidence(
     aligned: Mapping[str, tuple[float, dict[str, Any]]],
     numbers: dict[str, Any],
     patterns: Mapping[str, FixedPattern],
+    labels: Mapping[str, tuple[float, np.ndarray]],
     warnings: list[str],
 ) -> list[dict[str, Any]]:
     for view, (shift, said) in aligned.items():
@@ -384,13 +398,7 @@ def _evidence(
             "could_cost": "up to 0.5 % in the last tenths of a frame's range",
         },
         _pattern_evidence(patterns),
-        {
-            "term": "exposure errors",
-            "modelled": bool(exposures.ratios or exposures.across),
-            "because": f"{len(exposures.ratios)} ratios measured between frames of a view, {len(exposures.across)} "
-            "between plate and ball",
-            "could_cost": "up to 7 % between parts of the range that different frames cover",
-        },
+        bracket_exposure.label_evidence(labels, exposures),
         *([] if worst is None else [worst[1]]),
         {
             "term": "motion between frames",

@@ -331,3 +331,29 @@ def test_corridor_was_shot_in_thirds_whatever_exif_says():
     assert np.abs(np.corrcoef(steps, stated)[0, 1]) < 0.5  # what EXIF makes of them is rounding
     named = [labels.time_meant(seconds, "thirds") for seconds in times]
     np.testing.assert_allclose(-np.diff(np.log2(named)), 1 / 3, atol=1e-9)  # and that is what the names mean
+
+
+def test_what_labels_at_their_word_would_make_of_a_view_is_what_merging_by_them_makes():
+    """Three frames, photon weights: sums of charge over sums of exposure; one label says 1.4 times too long."""
+    found = np.array([1.0, 8.0, 64.0])
+    labelled = found * [1.4, 1.0, 1.0]
+    radiance = np.array([[0.9, 0.3], [0.05, np.nan]])
+    holds = radiance[..., None] * found < 1.0
+    merged = (holds * radiance[..., None] * found).sum(-1) / (holds * labelled).sum(-1)
+    whole, bands = bracket_exposure.label_cost(radiance, 1 / found, found, labelled)
+    seen = np.isfinite(radiance)
+    assert whole == pytest.approx(merged[seen].sum() / radiance[seen].sum())
+    assert bands[0] == pytest.approx(1 / 1.4)
+    assert np.isnan(bands[2])  # nothing is so dark that the longest holds it
+    assert bands[1] == pytest.approx(9 / 9.4)
+
+
+def test_labels_that_are_all_off_alike_cost_nothing():
+    found = np.array([1.0, 8.0])
+    costs = {view: bracket_exposure.label_cost(np.array([0.5, 0.05]), 1 / found, found, 1.3 * found) for view in "ab"}
+    ratio = Ratio(0, 1, 0.0, 0.01, 100)
+    exposures = bracket_exposure.Exposures(found, found, found, [ratio], [], {}, [])
+    said = bracket_exposure.label_evidence({"plate": costs["a"], "ball": costs["b"]}, exposures)
+    assert said["predicted_rel"] == pytest.approx(0)
+    assert said["bound_rel"] == pytest.approx(0)
+    assert said["modelled"]

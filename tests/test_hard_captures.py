@@ -14,6 +14,7 @@ from command import SAMPLES
 
 from pipeline.image.truth import load_truth
 from pipeline.light import near_field
+from pipeline.probes.anchor import MOST_LEFT_PX
 from pipeline.run import artifacts as A
 from pipeline.run import formats, settings, substitution
 from pipeline.run.runner import Build
@@ -118,8 +119,24 @@ def test_what_does_not_fit_the_lacquer_is_said(lacquer_build):
     """The board is not lacquered: its ink becomes darker than black when the gloss is taken off, and that is said."""
     said = json.loads((lacquer_build / "reflectance/record.json").read_text())["warnings"]
     assert any("lie below 0 beyond their noise" in line for line in said)
-    said = json.loads((lacquer_build / "probe/record.json").read_text())["warnings"]
-    assert any("reflectance of the ball" in line for line in said)
+
+
+def test_the_ball_on_lacquer_is_found_by_the_print_beside_it(lacquer_build):
+    """The window's mirror image changes the contrast of board and table by place, which moves nothing.
+
+    Measured: centre off by 0.28 mm, 0.3 px, most of it the pose's error; by the rim alone 1.0 mm.
+    """
+    found = numbers(lacquer_build, "probe")
+    anchor = found["ball_a"]["mirrored_plane"]
+    assert anchor["used"]
+    assert anchor["left_with_its_contrast_px"] > MOST_LEFT_PX  # what left the contrast free
+    true = json.loads((SAMPLES / "lacquer/truth/truth.json").read_text())["ball"]["centre_world_m"]
+    assert np.linalg.norm(np.subtract(found["ball_a"]["centre_world_m"], true)) < 5e-4
+    # The ratio of the plane's image to the plane is 14 to 28 % low for the same reason: the given is not doubted by it.
+    assert max(found["reflectance"]["sigma_rel"]) < 0.021
+    assert (
+        "for the plane's gloss" in evidence_of(lacquer_build, "probe", "reflectance measured from the plane")["because"]
+    )
 
 
 @pytest.mark.slow
@@ -170,7 +187,7 @@ def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_
 def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
     """The shift is the stated turn's; every exposure is that of the shutter, not of the label, but for a common factor.
 
-    Measured: 3.25 px of 3.18, exposures within 0.4 % where labels are 40 and 20 % off.
+    Measured: 3.25 px of 3.18, exposures within 0.6 % where labels are 40 and 20 % off.
     """
     camera = formats.read(cellar_build / "calibrate", A.CAMERA)
     merged = json.loads((cellar_build / "merge/record.json").read_text())
@@ -184,6 +201,26 @@ def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
     lies = np.array([np.log(row["label_s"] / truth[row["file"]]["true_s"]) for row in rows])
     assert np.ptp(lies) > np.log(1.4 / 0.8) - 0.1
     assert np.abs(off - np.median(off)).max() < 0.01
+
+
+@pytest.mark.slow
+def test_labels_of_the_cellar_at_their_word_cost_what_was_predicted(cellar_build, monkeypatch):
+    """Forced: exposures by their labels. Predicted: 2.7 % of the ball view's light, 32 % of what its short frames hold.
+
+    Those are the lamps. Measured: error on the objects 0.046 -> 0.077, of the shadows' change 0.062 -> 0.111, of the
+    albedo 0.098 -> 0.203: more than the first figure, as the lamps give half of the light on little of the picture.
+    """
+    from pipeline.image import bracket_exposure
+
+    said = evidence_of(cellar_build, "merge", "exposure errors")
+    assert said["modelled"]
+    assert said["bound_rel"] > 0.25
+    labels = bracket_exposure.by_labels
+    monkeypatch.setattr(bracket_exposure, "estimate", lambda _, samples, *rest: labels([one.frame for one in samples]))
+    before = json.loads((cellar_build / "evaluate/metrics.json").read_text())
+    after = forced(cellar_build, "brackets", lambda values: values["brackets"], monkeypatch)
+    for figure in ("object_rel_err", "shadow_change_err", "albedo_rel_err"):
+        assert said["predicted_rel"] / 2 < after[figure] - before[figure] < said["bound_rel"], figure
 
 
 # ---------------------------------------------------------------- corner: bright surfaces that light each other

@@ -47,6 +47,48 @@ def by_labels(frames: Sequence[Frame]) -> Exposures:
     return Exposures(values, values, np.full(len(values), exposure.LABEL_SIGMA), [], [], {}, [])
 
 
+def label_cost(
+    radiance: np.ndarray, clips: np.ndarray, found: np.ndarray, labelled: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """What a view would be, labels at their word, over what it is: of its light together, and of each band (F,) of it.
+
+    ``radiance``: merged samples. ``clips`` (F,): radiance at which each frame clips, falling; ``found``, ``labelled``
+    (F,): exposures as estimated and by labels. Band i lies below the clip of frame i and above that of frame i + 1, so
+    frames 0 to i hold it: by photon noise all their charge over all their exposure. A band without light is NaN.
+    """
+    level = np.maximum(np.nan_to_num(radiance, nan=0.0, posinf=0.0), 0).ravel()
+    band = np.searchsorted(-clips, -level, side="left")  # how many frames clip above this level
+    light = np.bincount(np.clip(band - 1, 0, None), level, len(clips))
+    each = np.cumsum(found) / np.cumsum(labelled)
+    whole = light @ each / light.sum() if light.any() else each[-1]
+    return float(whole), np.where(light > 0, each, np.nan)
+
+
+def label_evidence(costs: Mapping[str, tuple[float, np.ndarray]], exposures: Exposures) -> dict[str, Any]:
+    """Whether exposures are estimated, and what the labels' errors would do: ``costs`` of every view by `label_cost`.
+
+    Views are compared with the plate: what all have in common is the capture's unit, and costs nothing.
+    """
+    term = {
+        "term": "exposure errors",
+        "modelled": bool(exposures.ratios or exposures.across),
+        "because": f"{len(exposures.ratios)} ratios measured between frames of a view, {len(exposures.across)} between "
+        "plate and ball",
+    }
+    unit = costs["plate"][0] if "plate" in costs else 1.0
+    if not term["modelled"] or not unit > 0:
+        return {
+            **term,
+            "could_cost": "up to 7 % between parts of the range that different frames cover: labels round",
+        }
+    whole = {view: abs(factor / unit - 1) for view, (factor, _) in costs.items()}
+    bands = {view: float(np.nanmax(np.abs(each / unit - 1), initial=0.0)) for view, (_, each) in costs.items()}
+    view, band = (max(some, key=some.__getitem__, default="plate") for some in (whole, bands))
+    one, other = whole.get(view, 0.0), bands.get(band, 0.0)
+    cost = f"{one:.1%} of the light of {view} against the plate, {other:.1%} of what only some frames of {band} hold"
+    return {**term, "could_cost": cost, "predicted_rel": one, "bound_rel": other}
+
+
 def estimate(
     views: Sequence[str],
     samples: Sequence[Sample],
