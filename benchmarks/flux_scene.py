@@ -21,6 +21,7 @@ from pipeline.conventions import (
     latlong_solid_angles,
     transform_points,
 )
+from pipeline.simulation.lens import look_at
 from pipeline.types import Camera, Raster, View
 
 RADIUS = 0.04
@@ -331,17 +332,6 @@ def raster(
     variance = np.where(over[..., None], np.inf, sigma**2)
     channels = {**Raster.split(seen.astype(np.float32)), **Raster.split(variance.astype(np.float32), "variance")}
     return Raster({**channels, "mask": np.where(over, CLIPPED, 0).astype(np.uint32)}, "acescg")
-
-
-def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """world_from_camera (4, 4): z forward, y down."""
-    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
-    right = np.cross(forward, (0, 1, 0))
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    matrix[:3, 3] = position
-    return matrix
 
 
 def from_angles(elevation_deg: float, azimuth_deg: float) -> np.ndarray:

@@ -37,15 +37,7 @@ def best(picture: Raster, camera: Camera, radius: float, height: Height, places:
     """The largest statistic of the fits of four places; 0 without any."""
     signals, most, measured = finding.signals_of(picture, None), 0.0, finding.measured(picture)
     prior = height if on_plane else None
-    settled = []
-    for place in places:
-        if place[2] > radius:
-            centre, votes, _ = seeds.settle(signals, camera, radius, place, prior)
-            share, even = seeds.coverage(signals, camera, centre, radius)
-            settled.append(
-                ((share - even) * np.sqrt(min(radius_in_pixels(camera, centre, radius), 100)), centre, votes)
-            )
-    for _, centre, votes in sorted(settled, key=lambda one: -one[0])[:4]:
+    for centre, votes, _ in finding.settled(signals, camera, radius, list(places), prior)[:4]:
         fit = sphere_fit.fit_sphere(*measured, camera, radius, centre, prior, 0.0, 1.0, votes)[0]
         if fit.rms_px < finding.MAX_RMS_PX and fit.visible > seeds.MIN_FRAMED:
             merit = finding.seen(signals, camera, fit, radius)

@@ -14,52 +14,29 @@ from pipeline.capture.photographs import files_of, read_all
 from pipeline.capture.roles import Proposal, propose
 
 
-@pytest.fixture(scope="session")
-def desk_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/desk --quality draft``; read it, never write into it."""
-    out = tmp_path_factory.mktemp("desk") / "build"
-    done = command("run", DESK, "--out", out, "--quality", "draft")
-    assert done.returncode == 0, done.stderr
-    (out.parent / "stdout").write_text(done.stdout)
-    return out
+def draft_of(name: str):
+    """Fixture: build folder of ``insitu run sample_captures/<name> --quality draft``; read it, never write into it.
+
+    What the command printed is beside it, in ``stdout``.
+    """
+
+    @pytest.fixture(scope="session")
+    def build(tmp_path_factory) -> Path:
+        out = tmp_path_factory.mktemp(name) / "build"
+        done = command("run", SAMPLES / name, "--out", out, "--quality", "draft")
+        assert done.returncode == 0, done.stderr
+        (out.parent / "stdout").write_text(done.stdout)
+        return out
+
+    return build
 
 
-def draft_of(name: str, tmp_path_factory) -> Path:
-    """A draft build of a bundled capture, by the command."""
-    out = tmp_path_factory.mktemp(name) / "build"
-    done = command("run", SAMPLES / name, "--out", out, "--quality", "draft")
-    assert done.returncode == 0, done.stderr
-    return out
-
-
-@pytest.fixture(scope="session")
-def counter_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/counter --quality draft``; read it, never write into it."""
-    return draft_of("counter", tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def courtyard_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/courtyard --quality draft``; read it, never write into it."""
-    return draft_of("courtyard", tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def lacquer_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/lacquer --quality draft``; read it, never write into it."""
-    return draft_of("lacquer", tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def cellar_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/cellar --quality draft``; read it, never write into it."""
-    return draft_of("cellar", tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def corner_build(tmp_path_factory) -> Path:
-    """Build folder of ``insitu run sample_captures/corner --quality draft``; read it, never write into it."""
-    return draft_of("corner", tmp_path_factory)
+desk_build = draft_of("desk")
+counter_build = draft_of("counter")
+courtyard_build = draft_of("courtyard")
+lacquer_build = draft_of("lacquer")
+cellar_build = draft_of("cellar")
+corner_build = draft_of("corner")
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.lens import unproject
+from pipeline.simulation.lens import look_at as look_at
 from pipeline.types import Camera
 
 Light = Callable[[np.ndarray], np.ndarray]
@@ -143,17 +144,6 @@ def meets(origin: np.ndarray, w: np.ndarray, centre: np.ndarray, radius: float, 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
-    """world_from_camera (4, 4): z forward, y down."""
-    forward = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
-    right = np.cross(forward, (0, 1, 0))
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    matrix[:3, 3] = position
-    return matrix
 
 
 def photograph(

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from staged import look_at
 
 from pipeline.camera.lens import pixel_rays
 from pipeline.conventions import latlong_directions
+from pipeline.simulation.lens import look_at
 from pipeline.transport.scene import environment_emitter, ground_shape, ground_texture, proxy_shape
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Plane, Proxy, Raster, View

@@ -13,23 +13,13 @@ from pipeline.light import ball_shadow, prediction
 from pipeline.light.harmonics import COSINE_LOBE, sh9_of_environment
 from pipeline.probes import shadow_flux
 from pipeline.run import formats
+from pipeline.simulation.lens import look_at
 from pipeline.types import BallFit, Camera, Harmonics, Plane, Raster, View
 
 WIDTH, HEIGHT, FOCAL = 192, 128, 200.0
 RADIUS, ALBEDO = 0.04, 0.5
 CENTRE = np.array([0.1, RADIUS, 0.08])
 NORMAL = np.array([0.0, 1.0, 0.0])
-
-
-def look_at(eye, target) -> np.ndarray:
-    forward = np.asarray(target, float) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 1.0, 0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
-    pose[:3, 3] = eye
-    return pose
 
 
 def sky(height: int = 64) -> np.ndarray:

@@ -172,17 +172,10 @@ def best_fit(
 ) -> tuple[sphere_fit.SphereFit, sphere_fit.SphereFit] | None:  # fmt: skip
     """The fit, with and without the plane, whose outline most azimuths see; None without any."""
     prior = height if on_plane else None
-    settled = []
-    for place in places:
-        if place[2] > radius:
-            centre, votes, chance = seeds.settle(signals, camera, radius, place, prior)
-            share, even = seeds.coverage(signals, camera, centre, radius)
-            size = radius_in_pixels(camera, centre, radius)
-            settled.append(((share - even) * np.sqrt(min(size, 100.0)), centre, votes / max(chance, 1e-12), votes))
-    settled.sort(key=lambda place: -place[0])  # azimuths' excess over chance, in its spread: small outlines find more
     picture, variance, valid = measured(photograph)
     fits = []
-    for _, centre, contrast, votes in settled[:2]:
+    for centre, votes, chance in settled(signals, camera, radius, places, prior)[:2]:
+        contrast = votes / max(chance, 1e-12)
         pair = sphere_fit.fit_sphere(picture, variance, valid, camera, radius, centre, prior, 0.0, contrast, votes)
         if pair[0].rms_px < MAX_RMS_PX and np.linalg.norm(pair[0].centre) > 1.05 * radius:
             fits.append(tuple(replace(fit, support=seen(signals, camera, fit, radius)) for fit in pair))
@@ -193,6 +186,24 @@ def best_fit(
         return pair[0].merit * inside / (inside + beside + 1e-12)
 
     return max(fits, key=merit, default=None)  # type: ignore[arg-type, return-value]
+
+
+def settled(
+    signals: list[np.ndarray], camera: Camera, radius: float, places: list[np.ndarray], prior: Height | None
+) -> list[tuple[np.ndarray, float, float]]:
+    """Centre, votes and chance of `seeds.settle` from each of ``places`` (3,) before the camera, likeliest first.
+
+    By the azimuths' excess over chance, in its spread: small outlines find more.
+    """
+    found = []
+    for place in places:
+        if place[2] > radius:
+            centre, votes, chance = seeds.settle(signals, camera, radius, place, prior)
+            share, even = seeds.coverage(signals, camera, centre, radius)
+            size = radius_in_pixels(camera, centre, radius)
+            found.append(((share - even) * np.sqrt(min(size, 100.0)), (centre, votes, chance)))
+    found.sort(key=lambda place: -place[0])
+    return [place for _, place in found]
 
 
 def needed_merit(way: str, fit: sphere_fit.SphereFit) -> float:

@@ -78,6 +78,15 @@ def build(model: ObjectModel) -> Mesh:
     return vertices, normals, faces[area > 1e-12]
 
 
+def placed(model: ObjectModel) -> Mesh:
+    """An object where it stands: turned about +Y and moved, world frame."""
+    vertices, normals, faces = build(model)
+    cosine, sine = np.cos(np.radians(model.yaw_deg)), np.sin(np.radians(model.yaw_deg))
+    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    x, z = model.position_m
+    return vertices @ turn.T + [x, 0, z], normals @ turn.T, faces
+
+
 def stored_colour(model: ObjectModel) -> np.ndarray:
     """(3,) linear Rec.709 base colour as the .glb stores it, rounded to 1/255."""
     return np.round(np.asarray(model.base_color) * 255) / 255

@@ -202,10 +202,6 @@ class Twin(Place):
         """Every object, of its patch."""
         made = {}
         for model in self.scene.object:
-            vertices, normals, faces = shapes.build(model)
-            cosine, sine = np.cos(np.radians(model.yaw_deg)), np.sin(np.radians(model.yaw_deg))
-            turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-            x, z = model.position_m
             bsdf = self.mi.load_dict(
                 {
                     "type": "insitu_gltf",
@@ -214,8 +210,7 @@ class Twin(Place):
                     "roughness": model.roughness,
                 }
             )
-            placed = (vertices @ turn.T + [x, 0, z], normals @ turn.T, faces)
-            made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, bsdf)
+            made[f"object_{model.name}"] = mesh(self.mi, model.name, shapes.placed(model), bsdf)
         return made
 
     def photographer(self, world_from_camera: np.ndarray) -> dict[str, Any]:

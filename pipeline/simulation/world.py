@@ -235,17 +235,12 @@ class Place:
         """Every object as a Mitsuba mesh, where it stands."""
         made = {}
         for model in self.scene.object:
-            vertices, normals, faces = shapes.build(model)
-            cosine, sine = np.cos(np.radians(model.yaw_deg)), np.sin(np.radians(model.yaw_deg))
-            turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-            x, z = model.position_m
-            placed = (vertices @ turn.T + [x, 0, z], normals @ turn.T, faces)
             base = acescg_from_rec709() @ shapes.stored_colour(model)
             bsdf = {
                 "type": "insitu_gltf", "base_color": colour(base),
                 "metallic": model.metallic, "roughness": model.roughness,
             }  # fmt: skip
-            made[f"object_{model.name}"] = mesh(self.mi, model.name, placed, self.mi.load_dict(bsdf))
+            made[f"object_{model.name}"] = mesh(self.mi, model.name, shapes.placed(model), self.mi.load_dict(bsdf))
         return made
 
     def load(self, *parts: dict[str, Any], prints: bool = True) -> Any:
