@@ -7,6 +7,7 @@ that the map predicts. Limits: pictures are small and in the display's range; th
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,8 @@ def compute(
         layers, composite, display, plate_display, metrics, selfcheck, error_map, uncertainty,
         budget, records,
     )  # fmt: skip
-    sections = [section(build, name) for name in TITLES if name in records]
+    with ThreadPoolExecutor() as pool:  # pictures: display transform, means and JPEG hold no lock
+        sections = list(pool.map(lambda name: section(build, name), [name for name in TITLES if name in records]))
     names = [wish["name"] for wish in wishes.get("object", [])]
     lead = (
         f"{len(names)} object{'s' if len(names) != 1 else ''} in the photograph: {', '.join(names)}." if names else ""

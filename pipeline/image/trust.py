@@ -47,7 +47,10 @@ def shown(uncertainty: Raster, composite: Raster, budget: dict[str, Any], width:
 def modes(uncertainty: Raster, level: np.ndarray, width: int) -> list[fig.Figure]:
     """The largest shared errors: the composite's change per standard uncertainty."""
     names = [name for name in str(uncertainty.attributes.get("insitu:modes", "")).split(",") if name]
-    changes = {name: uncertainty.rgb(f"mode_{name}").astype(np.float32).mean(-1) * np.sqrt(3) / level for name in names}
+    changes = {}
+    for name in names:
+        red, green, blue = (uncertainty[f"mode_{name}.{c}"].astype(np.float32) for c in "RGB")
+        changes[name] = (red + green + blue) / (np.sqrt(3) * level)
     ordered = sorted(changes, key=lambda name: -float(np.square(changes[name]).mean()))
     return [
         fig.signed_figure(

@@ -14,6 +14,7 @@ does (`plane_image`).
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from pipeline.probes.observation import Quality, ViewMap
 from pipeline.probes.reflection import radians_per_pixel
 
 PATCH, REACH = 13, 7  # side of a patch, and largest shift that is looked for [px]
+STRIDE = PATCH // 2  # of the grid of patches
 MAX_SIGMA_PX = 0.35  # patches that know their place worse have too little texture
 MIN_PATCHES = 8
 FLOOR_PX = 0.3  # of a perfect ball: on ray-traced ones 0.1, on two demosaicked captures 0.2 to 0.3
@@ -62,7 +64,7 @@ def patch_shifts(pairs: Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ``pairs`` of every pixel. The patch is sought in the logarithm, its mean taken off: reflectance, dirt and gloss
     change the level, not the place. Parabola about the least sum of squares over whole pixels.
     """
-    from scipy.ndimage import uniform_filter
+    from scipy.ndimage import uniform_filter1d
 
     ok = (pairs.mirrored > 0).all(1) & (pairs.direct > 0).all(1)
     column, row = pairs.pixel[ok].T
@@ -75,30 +77,39 @@ def patch_shifts(pairs: Pairs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     real[at], model[at] = (np.log(part[ok] / level).mean(1) for part in (pairs.mirrored, pairs.direct))
     mask[at] = 1
     shifts = np.arange(-REACH, REACH + 1)
-    misfit = np.full((len(shifts), len(shifts), *size), np.inf)
-    padded = [np.pad(part, REACH) for part in (model, mask)]
-    for i, dy in enumerate(shifts):
+    known = np.pad(mask, REACH)
+    padded = np.pad(model, REACH)
+    rows, columns = (len(range(0, side, STRIDE)) for side in size)
+    misfit = np.full((len(shifts), len(shifts), rows, columns), np.inf)
+
+    def mean_of(values: np.ndarray) -> np.ndarray:
+        """Mean over each patch of the grid: rows that hold no patch are not taken any further."""
+        down = uniform_filter1d(values, PATCH, 0, mode="constant")[::STRIDE]
+        return np.asarray(uniform_filter1d(down, PATCH, 1, mode="constant")[:, ::STRIDE])
+
+    def compare(i: int) -> None:
         for j, dx in enumerate(shifts):
-            window = slice(REACH - dy, REACH - dy + size[0]), slice(REACH - dx, REACH - dx + size[1])
-            both = mask * padded[1][window]
-            left = (real - padded[0][window]) * both
-            share = uniform_filter(both, PATCH, mode="constant")
+            window = slice(REACH - shifts[i], REACH - shifts[i] + size[0]), slice(REACH - dx, REACH - dx + size[1])
+            both = mask * known[window]
+            left = (real - padded[window]) * both
+            share = mean_of(both)
             enough = share > 0.5
             safe = np.where(enough, share, 1)
-            mean = uniform_filter(left, PATCH, mode="constant") / safe
-            misfit[i, j] = np.where(
-                enough, np.maximum(uniform_filter(left**2, PATCH, mode="constant") / safe - mean**2, 0), np.inf
-            )
-    return _least(misfit, mask, low, shifts)
+            mean = mean_of(left) / safe
+            misfit[i, j] = np.where(enough, np.maximum(mean_of(left**2) / safe - mean**2, 0), np.inf)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(compare, range(len(shifts))))
+    return _least(misfit, low, shifts)
 
 
 def _least(
-    misfit: np.ndarray, mask: np.ndarray, low: np.ndarray, shifts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of misfits (K, K, H, W) by shift: centres, shifts and standard errors of a grid of patches that know them."""
+    misfit: np.ndarray, low: np.ndarray, shifts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Of misfits (K, K, M, N) by shift: centres, shifts and standard errors of the patches of a grid that know them."""
     centres, found, errors = [], [], []
-    for y in range(0, mask.shape[0], PATCH // 2):
-        for x in range(0, mask.shape[1], PATCH // 2):
+    for y in range(misfit.shape[2]):
+        for x in range(misfit.shape[3]):
             cost = misfit[:, :, y, x]
             i, j = np.unravel_index(cost.argmin(), cost.shape)
             if min(i, j) == 0 or max(i, j) == len(shifts) - 1 or np.isfinite(cost).mean() < 0.5:
@@ -118,7 +129,7 @@ def _least(
             # of a mean square over PATCH^2 pixels, whose neighbours share half of their noise
             error = np.sqrt(2 * 2 * least / (PATCH**2 * max(min(curvature), 1e-30)))
             if error < MAX_SIGMA_PX:
-                centres.append((x + low[1], y + low[0]))
+                centres.append((STRIDE * x + low[1], STRIDE * y + low[0]))
                 found.append((shifts[j] + place[0], shifts[i] + place[1]))
                 errors.append(error)
     return np.array(centres).reshape(-1, 2), np.array(found).reshape(-1, 2), np.array(errors)

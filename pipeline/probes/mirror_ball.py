@@ -79,23 +79,15 @@ class MirrorBall:
         gloss = any(one["used"] and "left_with_its_contrast_px" in one for one in anchors.values())
         known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM), glassy.glass, gloss)
         warnings += known.warnings + glassy.warnings
-        maps = {
-            name: view_map(
-                without(photographs[name], known.dirty.get(name)),
-                shots.camera_of(name),
-                views[name],
-                found[name],
-                radius,
-                known.surface,
-                grid,
-            )
-            for name in names
-        }
+
+        def mapped(name: str) -> ViewMap:
+            photograph, ball, view = without(photographs[name], known.dirty.get(name)), found[name], views[name]
+            shown = view_map(photograph, shots.camera_of(name), view, ball, radius, known.surface, grid)
+            return set_down(shown, ball.centre_world, radius, view.world_from_camera[:3, 3], glassy.glass)
+
+        with ThreadPoolExecutor() as pool:  # half of it is lookups and sums that hold no lock
+            maps = dict(zip(names, pool.map(mapped, names), strict=True))
         to_camera = {name: views[name].world_from_camera[:3, 3] - found[name].centre_world for name in names}
-        maps = {
-            name: set_down(view, found[name].centre_world, radius, views[name].world_from_camera[:3, 3], glassy.glass)
-            for name, view in maps.items()
-        }
         maps, people = photographer.shade(maps, to_camera, tripod)
         shaped = shape(maps, known.dents, glassy.direction_sigma_rad)
         warnings += shaped.warnings + ghosts_left(maps, glassy.glass)
