@@ -118,27 +118,39 @@ def _tangential(distortion: np.ndarray) -> tuple[float, float]:
 
 def distort(distortion: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Distorted normalised coordinates (..., 2) of undistorted ones (..., 2)."""
-    p1, p2 = _tangential(distortion)
     x, y = xy[..., 0], xy[..., 1]
     s = x * x + y * y
-    radial = _radial(distortion, s)
-    cross = 2 * x * y
-    return np.stack(
-        [x * radial + p1 * cross + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + p2 * cross], -1
-    )
+    return np.stack(_bent(distortion, x, y, s, _radial(distortion, s)), -1)
 
 
 def distortion_jacobian(distortion: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Derivative (..., 2, 2) of `distort` by the undistorted coordinates."""
-    p1, p2 = _tangential(distortion)
     x, y = xy[..., 0], xy[..., 1]
     s = x * x + y * y
-    radial, slope = _radial(distortion, s), _slope(distortion, s)
     jacobian = np.empty((*xy.shape, 2))
-    jacobian[..., 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-    jacobian[..., 0, 1] = jacobian[..., 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian[..., 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    across, cross, down = _growth(distortion, x, y, s, _radial(distortion, s))
+    jacobian[..., 0, 0], jacobian[..., 1, 1] = across, down
+    jacobian[..., 0, 1] = jacobian[..., 1, 0] = cross
     return jacobian
+
+
+def _bent(
+    distortion: np.ndarray, x: np.ndarray, y: np.ndarray, s: np.ndarray, radial: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted x, y of undistorted ones, of any one shape as all arguments; ``radial`` is ``g`` at ``s``."""
+    p1, p2 = _tangential(distortion)
+    cross = 2 * x * y
+    return x * radial + p1 * cross + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + p2 * cross
+
+
+def _growth(
+    distortion: np.ndarray, x: np.ndarray, y: np.ndarray, s: np.ndarray, radial: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of `_bent`: x' by x; x' by y, which is y' by x; y' by y."""
+    p1, p2 = _tangential(distortion)
+    slope = _slope(distortion, s)
+    cross = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    return radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, cross, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
 
 
 def coefficient_jacobian(distortion: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -187,19 +199,23 @@ def undistorted(distortion: np.ndarray, distorted: np.ndarray) -> tuple[np.ndarr
     """`undistort` (N, 2) without refusing, and which positions (N,) are inside; the others hold no ray."""
     if len(distortion) == 4:
         return _straight_fisheye(distortion, np.asarray(distorted, float))
-    xy = np.array(distorted, float)
+    there = np.array(np.moveaxis(np.asarray(distorted, float), -1, 0), order="C")
+    x, y = there.copy()
     for _ in range(NEWTON_STEPS):
-        residual = distort(distortion, xy) - distorted
-        jacobian = distortion_jacobian(distortion, xy)
-        a, b, d = jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 1]
-        determinant = a * d - b * b
+        s = x * x + y * y
+        radial = _radial(distortion, s)
+        across, cross, down = _growth(distortion, x, y, s, radial)
+        left = np.array(_bent(distortion, x, y, s, radial)) - there
+        determinant = across * down - cross * cross
         determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)  # a step near the fold is judged below
-        step = np.stack([d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - b * residual[..., 0]], -1)
-        step /= determinant[..., None]
-        length = np.hypot(step[..., 0], step[..., 1])[..., None]
-        xy -= step * np.minimum(1.0, 0.5 / np.maximum(length, 0.5))
+        step = np.array([down * left[0] - cross * left[1], across * left[1] - cross * left[0]]) / determinant
+        length = np.sqrt(step[0] * step[0] + step[1] * step[1])
+        if (length > 0.5).any():
+            step *= np.minimum(1.0, 0.5 / np.maximum(length, 0.5))
+        x, y = x - step[0], y - step[1]
         if length.max(initial=0.0) < 1e-9:  # quadratic: the step just taken left less than 1e-17
             break
+    xy = np.stack([x, y], -1)
     error = np.abs(distort(distortion, xy) - distorted).max(-1)
     return xy, (error < 1e-10) & ((xy**2).sum(-1) < fold_radius_squared(distortion))
 
