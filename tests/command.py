@@ -49,6 +49,23 @@ world_from_camera = [[1,0,0,0.1],[0,-0.70710678,-0.70710678,0.5],[0,0.70710678,-
 GIVEN = POSE.format(view="plate") + POSE.format(view="ball_a")
 
 
+def manifest(name: str, plate: str, ball: str, more: str = "", ball_camera: str = "", **given: float) -> str:
+    """A capture.toml of one plate and one ball, of a camera that is ``given``, and ``more`` tables."""
+    camera = "".join(f"{key} = {value}\n" for key, value in given.items())
+    own = f"camera = {ball_camera}\n" if ball_camera else ""
+    return f"""
+name = "{name}"
+[plate]
+files = ["{plate}"]
+[[ball]]
+name = "ball"
+files = ["{ball}"]
+{own}[probe]
+diameter_m = 0.08
+[camera.given]
+{camera}{more}"""
+
+
 def command(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own."""
     words = [sys.executable, "-m", "stages", *map(str, arguments)]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import manifest
 
 from pipeline.camera.markers import apply, square_homography
 from pipeline.conventions import CLIPPED
@@ -337,18 +338,7 @@ def test_a_collection_may_be_empty(shots):
 
 # ---- what capture.toml may say ---------------------------------------------------------------------------------------
 
-MANIFEST = """
-name = "two"
-[plate]
-files = ["plate.dng"]
-[[ball]]
-name = "ball"
-files = ["ball.dng"]
-[probe]
-diameter_m = 0.08
-[camera.given]
-width = 110
-[[reference]]
+REFERENCE = """[[reference]]
 name = "grey"
 kind = "grey_card"
 [[reference.seen]]
@@ -358,6 +348,7 @@ corners_px = [[20, 12], [88, 18], [83, 70], [16, 63]]
 view = "ball"
 corners_px = [[20, 12], [88, 18], [83, 70], [16, 63]]
 """
+MANIFEST = manifest("two", "plate.dng", "ball.dng", REFERENCE, width=110)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import manifest
 
 from pipeline.conventions import CLIPPED, DARK, GHOST, HOT
 from pipeline.image import colour
@@ -71,23 +72,7 @@ def write_frame(
     path.write_bytes(dng_bytes(mosaic, DngFacts(**{**values, **changes})))
 
 
-MANIFEST = """
-name = "small"
-[plate]
-files = ["plate/*.dng"]
-[[ball]]
-name = "ball"
-files = ["ball/*.dng"]
-[probe]
-diameter_m = 0.08
-[camera.given]
-width = 128
-height = 96
-fx = 100
-fy = 100
-cx = 64
-cy = 48
-"""
+MANIFEST = manifest("small", "plate/*.dng", "ball/*.dng", width=128, height=96, fx=100, fy=100, cx=64, cy=48)
 # label, true exposure: shared speeds are off by the same factor in both brackets
 PLATE = [(1 / 50, 0.0210), (1 / 10, 0.0960), (1 / 2, 0.51)]
 BALL = [(1 / 100, 0.0103), (1 / 50, 0.0210), (1 / 10, 0.0960), (1 / 2, 0.51)]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command import manifest
 from mirror_scene import Place, look_at, sky
 from mirror_scene import photograph as mirrored
 from printed_board import BOARD, charuco_print, looking_at, photograph
@@ -25,24 +26,7 @@ D65 = colour.xyz_of_xy(colour.REC709_CHROMATICITIES[3])
 DESK = Path(__file__).parents[1] / "sample_captures/desk"
 FASTER = 1.25  # the other body's sensitivity at one ISO
 
-MANIFEST = """
-name = "two"
-[plate]
-files = ["plate/*.dng"]
-[[ball]]
-name = "ball"
-files = ["ball/*.dng"]
-camera = { given = { width = 112, height = 80, fx = 90, fy = 90, cx = 56, cy = 40 } }
-[probe]
-diameter_m = 0.08
-[camera.given]
-width = 128
-height = 96
-fx = 100
-fy = 100
-cx = 64
-cy = 48
-[[reference]]
+REFERENCE = """[[reference]]
 name = "grey"
 kind = "grey_card"
 [[reference.seen]]
@@ -52,6 +36,10 @@ corners_px = [[32, 24], [96, 24], [96, 72], [32, 72]]
 view = "ball"
 corners_px = [[24, 20], [88, 20], [88, 68], [24, 68]]
 """
+BALL_CAMERA = "{ given = { width = 112, height = 80, fx = 90, fy = 90, cx = 56, cy = 40 } }"
+MANIFEST = manifest(
+    "two", "plate/*.dng", "ball/*.dng", REFERENCE, BALL_CAMERA, width=128, height=96, fx=100, fy=100, cx=64, cy=48
+)
 
 
 def scene(height: int, width: int, card: tuple[int, int, int, int]) -> np.ndarray:
