@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
-from pipeline.light import near_field, smooth
+from pipeline.light import near_field, resolution, smooth
 from pipeline.light.alike import ALIKE
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
@@ -97,7 +97,7 @@ def compute(
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
     evidence = [*observed.evidence, *lamps.evidence, *reasons(applied)]
     evidence += [combine.disagreement_reason(differing, len(maps)), filling.reason(filled, gap), near.evidence]
-    evidence.append(ground_gloss.reason(gloss))
+    evidence += [ground_gloss.reason(gloss), resolution.reason(rgb)]
     return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
 
 

@@ -39,6 +39,7 @@ from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
 
+WHITE = 0.8  # albedo of white paint
 BLURRED = 1 + 4 * BLUR**2  # interpolation errs by an eighth of second differences, the pilot's blur by 4 BLUR^2 more
 STATISTICS_PX = 1 << 20  # pixels of the plate from which its median noise and its exposure are taken
 WORTH_A_RAY = 0.15  # of the irradiance: a weaker light is sampled with the sky, by its brightness
@@ -311,20 +312,26 @@ def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
 
 
 def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, Any]]:
-    """What was modelled of the transport, and why."""
+    """What was modelled of the transport, and why. Savings suppose that every pixel costs what a traced one does."""
+    region, traced = numbers["influenced_fraction"], numbers["traced_fraction"]
+    between, deeper = BLURRED * params.threshold / 2, deeper_light(params.depth)
     return [
         {
             "term": "region",
-            "modelled": f"{numbers['influenced_fraction']:.1%} of the frame",
+            "modelled": region >= 1 or f"{region:.1%} of the frame",
             "because": f"a pilot found the rest to change by less than {numbers['threshold']:.2%}",
             "could_cost": f"{numbers['left_out_max']:.2%} of the plate where most is left out (pilot noise "
             f"{numbers['left_out_noise']:.2%}), {numbers['left_out_mean']:+.1e} of the frame's light",
+            "bound_rel": numbers["left_out_max"],
+            "saved_rel": 1 / region - 1,
         },
         {
             "term": "every pixel of the region",
-            "modelled": f"{numbers['traced_fraction']:.1%} of the frame traced, the rest of the region interpolated",
+            "modelled": traced >= region or f"{traced:.1%} of the frame traced, the rest of the region interpolated",
             "because": "second differences of the pilot bound the error of interpolation",
-            "could_cost": f"{BLURRED * params.threshold / 2:.2%} of the plate at most, and the pilot's noise",
+            "could_cost": f"{between:.2%} of the plate at most, and the pilot's noise",
+            "bound_rel": between,
+            "saved_rel": max(region / traced - 1, 0.0),
         },
         {
             "term": "light tracing",
@@ -337,21 +344,28 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "term": "denoiser",
             "modelled": params.denoise,
             "because": f"knob render.denoise; {params.samples} samples leave noise",
-            "could_cost": "fine detail of reflections; sharpness of caustics",
+            "could_cost": "fine detail of reflections; sharpness of caustics"
+            if params.denoise
+            else f"noise of {numbers.get('object_noise_rel', 0.0):.1%} on objects, a median",
         },
         {
             "term": "path depth",
             "modelled": params.depth,
             "because": "knob render.depth",
-            "could_cost": "light of more bounces",
-        },
-        {
-            "term": "near field of the probe",
-            "modelled": False,
-            "because": "the map is used as distant light",
-            "could_cost": "wrong light direction for lamps nearer than a few metres",
+            "could_cost": f"{deeper:.2%}: light of more bounces, next to a right angle of white surfaces",
+            "bound_rel": deeper,
         },
     ]
+
+
+def deeper_light(depth: int) -> float:
+    """Light of paths of more vertices than ``depth``, over that of one bounce, where surfaces face each other closely.
+
+    Each bounce keeps the albedo WHITE, and half of what leaves a surface meets the other, as next to the edge of two
+    at a right angle: a geometric series.
+    """
+    kept = WHITE / 2
+    return float(kept ** (depth - 1) / (1 - kept))
 
 
 STAGE = Stage(

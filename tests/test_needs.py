@@ -32,8 +32,12 @@ def test_a_bound_is_the_largest_percentage_in_the_words(text, bound):
 
 def test_a_stage_may_say_seconds_and_bound_itself():
     entry = {"term": "gloss", "modelled": False, "because": "no peak", "could_cost": "2 %"}
-    assert needs.told(entry, {}) == entry | {"saved_s": None, "bound_rel": 0.02}
-    assert needs.told(entry | {"saved_s": 1.5, "bound_rel": 0.03}, {}) == entry | {"saved_s": 1.5, "bound_rel": 0.03}
+    assert needs.told(entry, {}) == entry | {"saved_s": None, "bound_rel": 0.02, "bound_px": None}
+    said = entry | {"saved_rel": 1.5, "bound_rel": 0.03, "bound_px": 0.4}
+    assert needs.told(said, {}, 4.0) == entry | {"saved_s": 6.0, "bound_rel": 0.03, "bound_px": 0.4}
+    assert needs.told(said, {})["saved_s"] is None  # nobody knows what the stage took
+    in_part = entry | {"modelled": "half of it"}
+    assert needs.told(in_part, {})["bound_rel"] == 0.02
     modelled = entry | {"modelled": True}
     assert needs.told(modelled, {}) == modelled
 
@@ -56,19 +60,19 @@ def test_seconds_come_from_the_trade_where_the_entry_names_the_knob(tmp_path):
 
 def test_sums_are_over_what_is_known():
     terms = [
-        {"term": "a", "modelled": False, "saved_s": 2.0, "bound_rel": 0.03},
-        {"term": "b", "modelled": False, "saved_s": None, "bound_rel": 0.04},
-        {"term": "c", "modelled": False, "saved_s": None, "bound_rel": None},
+        {"term": "a", "modelled": False, "saved_s": 2.0, "bound_rel": 0.03, "bound_px": None},
+        {"term": "b", "modelled": "in part", "saved_s": None, "bound_rel": 0.04, "bound_px": None},
+        {"term": "c", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": None},
         {"term": "d", "modelled": True},
-        {"term": "e", "modelled": "in part"},
+        {"term": "e", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": 0.5},
     ]
     found = needs.left_out([{"terms": terms[:2]}, {"terms": terms[2:]}])
     assert found == {
-        "terms": 3, "bounded": 2, "bound_rel_sum": pytest.approx(0.07), "bound_rel_root": pytest.approx(0.05),
-        "timed": 1, "saved_s": 2.0,
+        "terms": 4, "bounded": 2, "moved": 1, "bound_rel_sum": pytest.approx(0.07),
+        "bound_rel_root": pytest.approx(0.05), "timed": 1, "saved_s": 2.0,
     }  # fmt: skip
     line = needs.summed(found)
     assert "7.0% if all" in line
     assert "5.0% if" in line
-    assert "1 of 3 terms" in line
+    assert "of 4 terms 1 only move things, 1 name no figure" in line
     assert "2.0 CPU s saved by 1" in line

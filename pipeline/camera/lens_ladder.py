@@ -324,7 +324,7 @@ def climb(start: Camera, poses: list[np.ndarray], photos: Photos, ladder: tuple[
     chosen = fit_model(start, poses, photos, terms)
     for step, entry in evidence.items():
         if not entry["modelled"]:
-            entry["could_cost"] = cost_of(step, terms, chosen, start, poses, photos)
+            entry |= cost_of(step, terms, chosen, start, poses, photos)
     return Climbed(chosen, photos, terms, best, errors, list(evidence.values()))
 
 
@@ -335,13 +335,13 @@ def cost_of(
     start: Camera,
     poses: list[np.ndarray],
     photos: Photos,
-) -> str:
-    """How far the lens with the term left out would be from the chosen one."""
+) -> dict[str, Any]:
+    """How far the lens with the term left out would be from the chosen one, in words and [px], as evidence has it."""
     try:
         shift = disagreement(chosen.camera, fit_model(start, poses, photos, terms + step).camera)
     except NumericalError:
-        return "unknown: these photographs do not determine it"
-    return f"{shift:.3f} px rms over the frame"
+        return {"could_cost": "unknown: these photographs do not determine it"}
+    return {"could_cost": f"{shift:.3f} px rms over the frame", "bound_px": float(shift)}
 
 
 def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:

@@ -63,7 +63,7 @@ def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed
     largest = float(np.hypot(*places.T).max())
     said = f"largest shift {largest:.3f} +- {sigma:.3f} px, quadrants within {max(s.quadrants for s in known):.2f} px"
     if largest < max(LEAST_PX, LEAST_SIGMAS * sigma):
-        return list(frames), largest, _evidence(False, said, f"blur of {largest:.3f} px")
+        return list(frames), largest, {**_evidence(False, said, f"blur of {largest:.3f} px"), "bound_px": largest}
     moved = [_moved(frame, *place) for frame, place in zip(frames, places, strict=True)]
     left = "up to a pixel and what turned" if frames[0].mosaic.ndim == 2 else "noise of moved frames is smoothed"
     return moved, largest, _evidence(True, said, left)

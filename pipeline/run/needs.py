@@ -1,8 +1,10 @@
 """What a build modelled, what it did not, on what evidence, what that could cost, and the seconds: from its records.
 
-An entry of a stage's evidence may say ``saved_s``, the CPU seconds that leaving the term out saved, and ``bound_rel``,
-the most that it could cost as a share. Else seconds come from `insitu trade` of the same build, where the entry names
-the knob, and bounds from the words of ``could_cost``: the largest percentage that they name outside brackets.
+An entry of a stage's evidence may say ``saved_rel``, what leaving the term out saved over what the stage took (from
+counts, not clocks: records hold no timings), and ``bound_rel``, the most that it could cost (share), or ``bound_px``,
+for what moves and does not change in brightness. Else seconds come from `insitu trade` of the same build, where the
+entry names the knob, and bounds from the words of ``could_cost``: the largest percentage that they name outside
+brackets.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ def needs(build: Build) -> dict[str, Any]:
     """Per stage: its terms with evidence and cost, seconds, and whether the record is still right.
 
     ``stages``: [{stage, seconds, cpu_seconds, stale, terms: [{term, modelled, because, could_cost}]}]; ``stale`` is
-    empty, or says why the record no longer holds. A term that was not modelled also has ``saved_s`` [CPU s] and
-    ``bound_rel``, each None where unknown. ``left_out``: how many those are, and over those that are known the sum of
-    the seconds, and of the bounds (and of their squares, rooted). Raises ArtifactError when a stage has not run.
+    empty, or says why the record no longer holds. A term that was not modelled, or in part, also has ``saved_s``
+    [CPU s], ``bound_rel`` and ``bound_px``, each None where unknown. ``left_out``: how many those are, and over those
+    that are known the sum of the seconds, and of the bounds (and of their squares, rooted).
+
+    Raises ArtifactError when a stage has not run.
     """
     bought = bought_by_knobs(build)
     records = {stage.name: build.record(stage.name) for stage in build.graph.stages}
@@ -46,7 +50,7 @@ def needs(build: Build) -> dict[str, Any]:
                 "seconds": record.get("seconds"),
                 "cpu_seconds": record.get("cpu_seconds"),
                 "stale": stale(build, stage.name),
-                "terms": [told(entry, bought) for entry in record.get("evidence") or []],
+                "terms": [told(entry, bought, record.get("cpu_seconds")) for entry in record.get("evidence") or []],
             }
         )
     return {
@@ -54,14 +58,20 @@ def needs(build: Build) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def told(entry: dict[str, Any], bought: dict[str, float]) -> dict[str, Any]:
-    """An entry of evidence, and of what was not modelled the seconds saved and the bound, None where unknown."""
+def told(entry: dict[str, Any], bought: dict[str, float], cpu_seconds: float | None = None) -> dict[str, Any]:
+    """An entry of evidence, and of what was not wholly modelled the seconds saved and the bound, None where unknown.
+
+    ``cpu_seconds``: of its stage.
+    """
     term = {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
-    if entry.get("modelled") is not False:
+    if entry.get("modelled") is True:
         return term
     knob = NAMED.search(str(term["because"]))
-    saved = entry.get("saved_s", bought.get(knob[1]) if knob else None)
-    return {**term, "saved_s": saved, "bound_rel": entry.get("bound_rel", bound_in(str(term["could_cost"])))}
+    saved = bought.get(knob[1]) if knob else None
+    if saved is None and cpu_seconds is not None and "saved_rel" in entry:
+        saved = cpu_seconds * entry["saved_rel"]
+    bound = entry.get("bound_rel", bound_in(str(term["could_cost"])))
+    return {**term, "saved_s": saved, "bound_rel": bound, "bound_px": entry.get("bound_px")}
 
 
 def bound_in(text: str) -> float | None:
@@ -87,12 +97,13 @@ def bought_by_knobs(build: Build) -> dict[str, float]:
 
 
 def left_out(stages: list[dict[str, Any]]) -> dict[str, Any]:
-    """Sums over what was not modelled; how many of the terms tell nothing."""
-    terms = [term for stage in stages for term in stage["terms"] if term["modelled"] is False]
+    """Sums over what was not modelled, or in part; how many of the terms tell nothing."""
+    terms = [term for stage in stages for term in stage["terms"] if term["modelled"] is not True]
     bounds = [term["bound_rel"] for term in terms if term["bound_rel"] is not None]
+    moved = [term for term in terms if term["bound_rel"] is None and term["bound_px"] is not None]
     saved = [term["saved_s"] for term in terms if term["saved_s"] is not None]
     return {
-        "terms": len(terms), "bounded": len(bounds), "bound_rel_sum": math.fsum(bounds),
+        "terms": len(terms), "bounded": len(bounds), "moved": len(moved), "bound_rel_sum": math.fsum(bounds),
         "bound_rel_root": math.hypot(0.0, *bounds), "timed": len(saved), "saved_s": math.fsum(saved),
     }  # fmt: skip
 
@@ -136,9 +147,10 @@ def as_text(found: dict[str, Any], build: Build) -> str:
                 lines += wrapped("how far", term["modelled"])
             lines += wrapped("because", term["because"]) + wrapped("could cost", term["could_cost"])
             if "saved_s" in term:
-                saved, bound = term["saved_s"], term["bound_rel"]
+                saved, bound, px = term["saved_s"], term["bound_rel"], term["bound_px"]
                 lines += wrapped("saved", "-" if saved is None else f"{saved:.1f} CPU s")
-                lines += wrapped("bound", "-" if bound is None else f"{bound:.1%}")
+                shift = "-" if px is None else f"{px:.3f} px"
+                lines += wrapped("bound", shift if bound is None else f"{bound:.2%}")
     terms = [term for stage in found["stages"] for term in stage["terms"]]
     counts = [sum(term["modelled"] is state for term in terms) for state in (True, False)]
     lines += ["", f"modelled {counts[0]}, not {counts[1]}, in part {len(terms) - sum(counts)}"]
@@ -150,10 +162,11 @@ def as_text(found: dict[str, Any], build: Build) -> str:
 
 def summed(left: dict[str, Any]) -> str:
     """One line on what was not modelled, all together."""
+    silent = left["terms"] - left["bounded"] - left["moved"]
     line = (
-        f"not modelled could cost {left['bound_rel_sum']:.1%} if all bounds were met at once, "
-        f"{left['bound_rel_root']:.1%} if they were independent; "
-        f"{left['terms'] - left['bounded']} of {left['terms']} terms name no percentage"
+        f"not modelled, or in part, could cost {left['bound_rel_sum']:.1%} if all bounds were met at once, "
+        f"{left['bound_rel_root']:.1%} if they were independent; of {left['terms']} terms "
+        f"{left['moved']} only move things, {silent} name no figure"
     )
     return line + (f"; {left['saved_s']:.1f} CPU s saved by {left['timed']} of them" if left["timed"] else "")
 
