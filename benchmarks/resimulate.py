@@ -2,11 +2,12 @@
 
     .venv/bin/python -m benchmarks.resimulate SCENE.toml CAPTURE FOLDER COUNT
 
-The truth of the bundled CAPTURE that SCENE.toml made (plate, plate with objects, coverage) is brought to half its size,
-2 x 2 pixels to one, which leaves it less noise than it had; ball views and board photographs are rendered at that size.
+The truth of the bundled CAPTURE that SCENE.toml made (plate, plate with objects, coverage) is brought to `WIDTH` pixels
+across, 2 x 2 to one where it is twice as wide, which leaves it less noise than it had; ball views and board photographs
+are rendered at that size.
 All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern, hot photosites, JPEG
 noise of the board photographs, corners (so lens and pose of its own) and shutter: each setting of the dial is off by
-`DIAL`, each frame by `FRAME` more. Its cameras are turned by up to half a pixel, so that lamps and edges fall otherwise
+`DIAL`, each frame by `FRAME` more. Its cameras are turned by up to a pixel, so that lamps and edges fall otherwise
 on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`).
 """
 
@@ -29,13 +30,13 @@ from pipeline.simulation.world import Place
 from pipeline.transport.variant import use_mitsuba
 from stages import simulate
 
-HALF = 2  # pixels of the bundled truth along a side that become one
+WIDTH = 512  # px of a frame: wider truths are halved until they fit
 SAMPLING = {"ball": 64, "calibration": 32, "environment": 64, "environment_width": 256}
 BLUR_PX = 0.76  # of the lens: at 0.55 lamps, 2 px small in the ball, alias on the mosaic by 3 % of their colour
-SOFT_PX = 0.66  # Gaussian on the halved truth: 0.37 px are its own, together `BLUR_PX`
 DIAL = 0.01  # of log time, of each setting of the shutter; real ones are off by up to several percent
 CORNER_PX = 0.1  # of each corner, as the pose stage takes its own at the full size
 FRAME = 0.002  # of log time, of each frame: what one setting repeats to
+TURN_PX = 1.0  # of each camera, either way: a whole period of the mosaic, so that lamps fall on it in every way alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,49 +61,66 @@ class Pictures:
             return cls(kept["plate"], balls, [kept[n] for n in sorted(kept.files) if n.startswith("board:")])
 
 
+def factor_of(scene: SimulatedScene) -> int:
+    """Pixels of the bundled truth along a side that become one."""
+    return max(1, scene.camera.width // WIDTH)
+
+
+def softened_by(own_px: float, factor: int) -> float:
+    """Sigma [px] that brings means over factor x factor pixels of a picture as soft as ``own_px`` to `BLUR_PX`.
+
+    A picture's own Gaussian holds its pixel's box, so what averaging adds is the variance of the pixels' centres.
+    """
+    return float(np.sqrt(BLUR_PX**2 - (own_px / factor) ** 2 - (1 - factor**-2) / 12))
+
+
 def reduced(scene: SimulatedScene) -> SimulatedScene:
-    """The scene at half its frame, with fewer samples."""
-    camera = scene.camera
+    """The scene at the reduced frame, with fewer samples."""
+    camera, factor = scene.camera, factor_of(scene)
     smaller = camera.model_copy(
-        update={n: getattr(camera, n) / HALF for n in ("fx", "fy", "cx", "cy")}
-        | {n: getattr(camera, n) // HALF for n in ("width", "height")}
+        update={n: getattr(camera, n) / factor for n in ("fx", "fy", "cx", "cy")}
+        | {n: getattr(camera, n) // factor for n in ("width", "height")}
         | {"blur_sigma_px": BLUR_PX}
     )
     sampling = scene.sampling.model_copy(update=SAMPLING)
     return scene.model_copy(update={"camera": smaller, "sampling": sampling})
 
 
-def halved(values: np.ndarray) -> np.ndarray:
-    """(H / 2, W / 2, ...) means over 2 x 2 pixels, a little softened."""
-    height, width = (size // HALF for size in values.shape[:2])
-    small = values.reshape(height, HALF, width, HALF, -1).mean((1, 3)).reshape(height, width, *values.shape[2:])
-    return np.asarray(blur(np.asarray(small, float), SOFT_PX))
+def smaller(values: np.ndarray, factor: int, soft_px: float) -> np.ndarray:
+    """(H / factor, W / factor, ...) means over factor x factor pixels, a little softened."""
+    height, width = (size // factor for size in values.shape[:2])
+    small = values.reshape(height, factor, width, factor, -1).mean((1, 3)).reshape(height, width, *values.shape[2:])
+    return np.asarray(blur(np.asarray(small, float), soft_px))
 
 
-def halve_truth(bundled: Path, folder: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Truth pictures of ``bundled`` at half their size, written into ``folder``; returns the plate (H, W, 3)."""
+def reduce_truth(bundled: Path, folder: Path, shape: tuple[int, int], factor: int, own_px: float) -> np.ndarray:
+    """Truth pictures of ``bundled``, as soft as ``own_px``, made smaller and written; returns the plate (H, W, 3)."""
+
+    def shrunk(values: np.ndarray) -> np.ndarray:
+        return smaller(values, factor, softened_by(own_px, factor))
+
     pictures = {}
     for name in ("plate", "with_objects", "albedo"):
         raster = read_exr(bundled / f"{name}.exr")
-        extra = {"seen": halved(raster["seen"][..., None])[..., 0]} if "seen" in raster.channels else {}
-        pictures[name] = halved(raster.rgb())
+        extra = {"seen": shrunk(raster["seen"][..., None])[..., 0]} if "seen" in raster.channels else {}
+        pictures[name] = shrunk(raster.rgb())
         capture.write_picture(folder / f"{name}.exr", pictures[name], extra)
-    layers = {n: halved(v[..., None])[..., 0] for n, v in read_exr(bundled / "coverage.exr").channels.items()}
+    layers = {n: shrunk(v[..., None])[..., 0] for n, v in read_exr(bundled / "coverage.exr").channels.items()}
     capture.write_layers(folder / "coverage.exr", layers, shape)
     light = read_exr(bundled / "environment.exr")
     capture.write_picture(folder / "environment.exr", light.rgb())
     return pictures["plate"]
 
 
-def render(scene: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
+def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     """Radiance of all photographs; truth and objects are written into ``folder``. Minutes."""
-    mi = use_mitsuba()
+    mi, scene = use_mitsuba(), reduced(whole)
     studio = simulate.Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera))
     shoot = capture.Shoot(scene, folder, capture.sensor_of(scene))
     views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view]}
     for model in scene.object:
         shapes.write_glb(folder / "objects" / f"{model.name}.glb", shapes.build(model), model)
-    plate = halve_truth(bundled, folder / "truth", studio.shape)
+    plate = reduce_truth(bundled, folder / "truth", studio.shape, factor_of(whole), whole.camera.blur_sigma_px)
     record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, {})
     capture.write_truth(folder / "truth" / "truth.json", record)
     balls = {view.name: simulate.ball_picture(studio, view, say) for view in scene.ball_view}
@@ -143,7 +161,7 @@ def turns(scene: SimulatedScene) -> dict[str, np.ndarray]:
     random = np.random.default_rng([scene.seed, 7])
     found: dict[str, np.ndarray] = {}
     for view in [scene.plate, *scene.ball_view]:
-        angles = random.uniform(-0.5, 0.5, 2) / (scene.camera.fx, scene.camera.fy)
+        angles = random.uniform(-TURN_PX, TURN_PX, 2) / (scene.camera.fx, scene.camera.fy)
         alone = view is scene.plate or view.position_m is not None
         found[view.name] = rotation_exp(np.array([*angles, 0.0])) if alone else found[scene.plate.name]
     return found
@@ -182,7 +200,7 @@ def write_truth_of(scene: SimulatedScene, shared: Path, out: Path, turned: dict[
 def write_poses(scene: SimulatedScene, manifest: Path, turned: dict[str, np.ndarray]) -> None:
     """Append the board's inner corners as surveyed points of the plate and of ball views that moved.
 
-    At half the size its markers are too small to be read; so corners are where they truly are, off by `CORNER_PX`.
+    At this size its markers are too small to be read; so corners are where they truly are, off by `CORNER_PX`.
     """
     board, lens = scene.board, capture.lens_of(scene.camera)
     assert board is not None
@@ -224,12 +242,12 @@ def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: P
 
 def place_of(scene_toml: Path, bundled: Path, folder: Path) -> tuple[SimulatedScene, Pictures]:
     """The reduced scene and its pictures, rendered when they are not there; ``bundled``: the capture with its truth."""
-    scene = reduced(load_scene(scene_toml))
+    whole = load_scene(scene_toml)
     kept = folder / "radiance.npz"
     if not kept.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        render(scene, bundled / "truth", folder).save(kept)
-    return scene, Pictures.load(kept)
+        render(whole, bundled / "truth", folder).save(kept)
+    return reduced(whole), Pictures.load(kept)
 
 
 if __name__ == "__main__":

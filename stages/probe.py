@@ -17,7 +17,7 @@ from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, resolution, smooth
-from pipeline.light.alike import ALIKE
+from pipeline.light.alike import ALIKE, ALIKE_VIEWS
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import clipped, combine, filling, ground_gloss, levelling
@@ -88,7 +88,7 @@ def compute(
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
         | {SCALE_SIGMA: " ".join(f"{sigma:.6g}" for sigma in np.broadcast_to(shared, 3))}
-        | ({} if alike is None else {ALIKE: f"{alike:.4g}"})
+        | ({} if alike is None else {ALIKE: f"{alike:.4g}", ALIKE_VIEWS: combine.equal_views(merged)})
         | near_field.places(centre if near.target is None else near.target, centre),
     )
     coefficients = sh9_of_environment(rgb)

@@ -1,11 +1,11 @@
 """How far each pixel can be trusted: the stated uncertainties of all stages, carried to the composite.
 
 Independent per pixel: the plate's noise and what sampling and denoising left of the render. Shared: a few modes, each
-exported as the change of the composite per standard uncertainty (scale of the light, flux of each lamp, the sky in
-lobes, turns of the map, pose and lens). Light enters linearly and is rendered once per pattern, few pixels, few samples
-(`pipeline.budget.response`); patterns too weak to matter are left out and said. ``sigma`` is relative to the plate's
-own scale: what plate and light share (the capture's one unit) is no error here. Limits: first order; reflectance of the
-objects is taken as wished; what no stage states an uncertainty for is named in ``not_covered``, in the stage's words.
+exported as the change of the composite per standard uncertainty (scale of the light, flux and width of lamps, the sky
+in lobes, turns of the map, pose and lens). Light enters linearly and is rendered once per pattern, few pixels, few
+samples (`pipeline.budget.response`); patterns too weak to matter are left out and said. ``sigma`` is relative to the
+plate's own scale: what plate and light share (the capture's one unit) is no error here. Limits: first order; what the
+objects reflect is taken as wished; what no stage states an uncertainty for is named in ``not_covered``, in its words.
 """
 
 from __future__ import annotations
@@ -189,6 +189,7 @@ def patterns(
     tied = next((balance[name].covariance for name in [*balls, *balance] if name in balance), None)
     found = light.scale_patterns(light.scale_covariance(shared, tied))
     found += light.flux_patterns(environment, emitters, shared) + light.sky_patterns(environment, emitters, shared)
+    found += light.width_patterns(environment, emitters)
     if balls:
         found += light.turn_patterns(environment, light.direction_covariance(balls, views))
     return light.worth_following(found, share)
@@ -207,6 +208,11 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
         elif pattern.radiance is not None:
             seen = studio.seen(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
             change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
+        elif pattern.lamps is not None:
+            narrow = pattern.lamps
+            apart = studio.seen(narrow.rgb, narrow.emitters).minus(whole)
+            share = (studio.upward(narrow.rgb) - studio.irradiance) / studio.irradiance
+            change = response.of_turn(apart, share)
         else:
             assert pattern.turn is not None
             angle = float(np.linalg.norm(pattern.turn))

@@ -42,16 +42,34 @@ def flux_of(rgb: np.ndarray, texels: np.ndarray, direction: np.ndarray) -> np.nd
     return (weight[..., None] * rgb).reshape(-1, 3)[texels].sum(0)
 
 
-def test_texels_within_a_cell_err_together_and_cells_apart():
+def test_noise_is_alike_within_a_pixel_and_a_displacement_cancels_about_a_lamp():
     rgb, texels = square_lamp()
     direction = latlong_directions(256, 512)[102, 2]
     flux = flux_of(rgb, texels, direction)
-    whole = alike.flux_sigma(map_of(rgb, 0.1 * rgb, {}), texels, direction)
-    assert whole == pytest.approx(0.1 * flux, rel=1e-6)  # all in one cell of 2.8 degrees
-    fine = map_of(rgb, 0.1 * rgb, {alike.ALIKE: "0.7"})  # cells of one texel
+    fine = map_of(rgb, 0.1 * rgb, {alike.ALIKE: "0.7"})  # pixels of one texel
     lamp = (latlong_solid_angles(256, 512)[..., None] * rgb) * (rgb > 1)
-    sampled = alike.sampling_sigma(fine, lamp)
-    assert alike.flux_sigma(fine, texels, direction) == pytest.approx(np.hypot(0.1 / 4, sampled) * flux, rel=1e-3)
+    noise, sampled = 0.1 / 4, alike.sampling_sigma(fine, lamp)
+    # About an even lamp slopes point inwards all round: of 16 errors, those of one side undo those of the other.
+    assert alike.displaced_sums(0.1 * lamp, rgb) == pytest.approx(np.zeros((2, 3)), abs=0.01 * 0.1 * lamp.sum() / 3)
+    assert alike.flux_sigma(fine, texels, direction) == pytest.approx(np.maximum(noise, sampled) * flux, rel=0.03)
+    one = alike.flux_sigma(map_of(rgb, 0.1 * rgb, {alike.ALIKE: "12"}), texels, direction)  # a pixel of six texels
+    assert one == pytest.approx(flux * np.maximum(0.1, alike.sampling_sigma(map_of(rgb, 0, {alike.ALIKE: "12"}), lamp)))
+
+
+def test_half_a_lamp_errs_by_its_displacement():
+    """The flux of a smooth lamp's one half, moved by d, is off by d times what lies on the line that divides it."""
+    directions = latlong_directions(256, 512)
+    east = np.arctan2(directions[..., 0], -directions[..., 2])
+    rgb = np.repeat(np.exp(-0.5 * ((east**2 + np.arcsin(directions[..., 1]) ** 2) / 0.1**2))[..., None], 3, -1)
+    solid = latlong_solid_angles(256, 512)[..., None]
+    step = 2 * np.pi / 512  # of one column, on the equator
+    slopes = [(np.roll(rgb, 1, axis) - np.roll(rgb, -1, axis)) / 2 for axis in (0, 1)]
+    sigma = np.hypot(*slopes)  # of a displacement by one texel along each axis
+    half = east[..., None] > 0
+    moved = alike.displaced_sums(solid * sigma * half, rgb)
+    line = rgb[:, :2].mean(1).sum(0) * np.pi / 256 * step
+    assert np.abs(moved[0]) == pytest.approx(line, rel=0.03)  # a texel is a twelfth of the lamp's width
+    assert np.abs(alike.displaced_sums(solid * sigma, rgb)) == pytest.approx(np.zeros((2, 3)), abs=1e-3 * line[0])
 
 
 def test_what_all_share_and_what_was_recovered_add_without_root():
@@ -133,15 +151,14 @@ def errors(radius_px: int, half_angle_deg: float, method: Method, seeds: int = 2
 
 @pytest.mark.parametrize(("radius_px", "half_angle_deg", "method"), [(60, 4.0, "malvar"), (120, 2.0, "bilinear")])
 def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg, method):
-    """Lamps of 20 pixels. Measured over 21 lamps each: rms of error over sigma, Malvar and bilinear, 0.68 and 1.3
-    (60 px, 2 degrees: 10 pixels), 0.58 and 0.71 (60, 4), 0.58 and 0.74 (120, 2), 0.64 and 0.55 (120, 4), 1.1 and 0.65
-    (240, 4); of 7 pixels 1.2 and 7.6 (60, 1).
+    """Lamps of 20 pixels. Measured over 21 lamps each: rms of error over sigma, Malvar and bilinear, 1.04 and 2.0
+    (60 px, 2 degrees: 10 pixels), 0.90 and 1.09 (60, 4), 0.90 and 1.15 (120, 2), 1.00 and 0.85 (120, 4).
     Here 14 lamps of 3 channels: the rms of 42 values is known to 11 %, twice that as lamps' channels are not alone.
     """
     z = errors(radius_px, half_angle_deg, method)
     assert len(z) >= 10
-    assert 0.3 < np.sqrt((z**2).mean()) < 1.1
-    assert (np.abs(z) < 2).mean() > 0.9
+    assert 0.6 < np.sqrt((z**2).mean()) < 1.4
+    assert (np.abs(z) < 2).mean() > 0.88
 
 
 def test_sampling_counts_the_pixels_that_a_lamp_covers():
@@ -152,4 +169,6 @@ def test_sampling_counts_the_pixels_that_a_lamp_covers():
     pixel = float(np.degrees(np.sqrt(weight.reshape(-1)[texels].sum() / 10)))  # the lamp covers ten
     told = map_of(rgb, 0.0, {alike.ALIKE: repr(alike.ALIKE_PX * pixel)})
     assert alike.sampling_sigma(told, weight * alone) == pytest.approx(alike.SAMPLED / 10, rel=1e-3)
+    both = map_of(rgb, 0.0, {alike.ALIKE: repr(alike.ALIKE_PX * pixel), alike.ALIKE_VIEWS: "2"})
+    assert alike.sampling_sigma(both, weight * alone) == pytest.approx(alike.SAMPLED / 10 / np.sqrt(2), rel=1e-3)
     assert not alike.sampling_sigma(map_of(rgb, 0.0, {}), weight * alone).any()

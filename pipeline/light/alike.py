@@ -2,9 +2,10 @@
 
 The map's stated variance is a texel's. Three things tie texels together. What all share (exposure between plate and
 probe, reflectance of the ball) is stated in the map's header. What one flux was recovered for, its texels share. The
-rest is the probe's picture: where it is displaced, all texels within a few pixels err together, so those count as alike
-within cells, and as independent beyond. How its pixels sample a small lamp, each colour of a mosaic by itself, no texel
-knows: that error is the lamp's, by the pixels that it covers.
+rest is the probe's picture: where it is displaced, texels within a few pixels err together, so those count as alike
+within cells, and as independent beyond. About a whole lamp they err with both signs, brighter where it moved to, darker
+where it left: that cancels. How its pixels sample a small lamp, each colour of a mosaic by itself, no texel knows: that
+error is the lamp's, by the pixels that it covers.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from pipeline.light.environment import SCALE_SIGMA
 from pipeline.types import Raster
 
 ALIKE = "insitu:alike_deg"  # in a map's header: width of the cells within which texels err alike
+ALIKE_VIEWS = "insitu:alike_views"  # in a map's header: how many equal views its light is the mean of
 ALIKE_PX = 3.0  # pixels of the probe's picture: demosaicking takes in two to each side
 ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
 # Relative error of a lamp's light (R, G, B) times the pixels that it covers, each colour sampled by a mosaic by itself.
-# Lamps of ten pixels and more, of 1 to 4 degrees in balls of 40 to 240 px, are off by 0.5 to 1.3 times the sigma that
-# this gives (rms, bilinear and Malvar; tests/test_alike.py); smaller ones by more where demosaicking is bilinear.
-SAMPLED = np.array([2.0, 1.0, 2.0])
+# So chosen that errors of lamps of 2 to 4 degrees, 10 to 80 pixels, in balls of 60 and 120 px are 0.9 to 1.0 times the
+# sigma that it gives (rms over 21 lamps each, Malvar), 0.85 to 1.15 times by bilinear demosaicking from 20 pixels on,
+# twice at ten (tests/test_alike.py).
+SAMPLED = np.array([1.3, 0.65, 1.3])
 
 
 def alike_rows(environment: Raster) -> int:
@@ -63,7 +66,7 @@ def cell_sums(values: np.ndarray, rows: int) -> np.ndarray:
 def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     """Relative sigma (3,) of the sum of ``light`` (H, W, 3) by the pixels that it covers; zero where no map says so.
 
-    Covered is ``(sum L)^2 / sum L^2`` over solid angle. It is at most 1.
+    Covered is ``(sum L)^2 / sum L^2`` over solid angle. It is at most 1. Views lie on their mosaics independently.
     """
     if ALIKE not in environment.attributes:
         return np.zeros(3)
@@ -71,13 +74,33 @@ def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     solid = latlong_solid_angles(*environment.shape)[..., None]
     squares = (np.square(light) / solid).sum((0, 1))
     covered = np.divide(light.sum((0, 1)) ** 2, squares, out=np.full(3, np.inf), where=squares > 0)
-    return np.asarray(np.minimum(SAMPLED / np.maximum(covered / pixel, 1), 1))
+    views = float(environment.attributes.get(ALIKE_VIEWS, 1.0))
+    return np.asarray(np.minimum(SAMPLED / np.maximum(covered / pixel, 1) / np.sqrt(views), 1))
+
+
+def displaced_sums(values: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """What errors (H, W, C), one sigma each, of a displaced picture ``light`` (H, W, 3) sum to: (2, C), east and south.
+
+    A picture displaced by d errs by -grad L . d: brighter on one side of a lamp by what the other side lacks. So errors
+    add with the cosine of the gradient's direction, and what lies about a whole lamp cancels; where a sum ends within
+    the light's slope it does not.
+    """
+    height = len(light)
+    grey = np.pad(light.mean(-1), ((0, 0), (1, 1)), "wrap")
+    sine = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None]
+    slope = np.stack([np.gradient(grey, axis=1)[:, 1:-1] / sine, np.gradient(grey, axis=0)[:, 1:-1]])
+    size = np.linalg.norm(slope, axis=0)
+    cosine = np.divide(slope, size, out=np.zeros(slope.shape), where=size > 0)
+    return np.asarray((cosine[..., None] * values).sum((1, 2)))
 
 
 def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Sigma (3,) of the irradiance that texels (N,), flat indices, give a surface that faces ``direction`` (3,).
 
-    Recovered texels share one error, and their variance holds the map's own scale; zero for a map without variance.
+    A texel's own variance is noise, alike within a pixel of the probe's picture; or a displacement of that picture; or,
+    where views differ by how their mosaics sampled a lamp, it was raised for that. Which, it does not say: the largest
+    of the three counts. Recovered texels share one error, and their variance holds the map's own scale. Zero for a map
+    without variance.
     """
     height, width = environment.shape
     inside = np.zeros((height, width), bool)
@@ -91,9 +114,7 @@ def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -
     all_of_it = shared * measured.sum((0, 1))
     known = "variance.R" in environment.channels
     sampled = sampling_sigma(environment, measured) * measured.sum((0, 1))
-    total = (
-        one.sum((0, 1)) ** 2
-        + (cell_sums(own, alike_rows(environment)) ** 2).sum(0)
-        + known * (all_of_it**2 + sampled**2)
-    )
+    pixel = max(1, round(alike_rows(environment) / ALIKE_PX))
+    causes = (cell_sums(own, pixel) ** 2).sum(0), (displaced_sums(own, environment.rgb()) ** 2).sum(0), sampled**2
+    total = one.sum((0, 1)) ** 2 + known * (np.max(causes, 0) + all_of_it**2)
     return np.asarray(np.sqrt(total))

@@ -88,6 +88,13 @@ def alike_deg(views: list[ViewMap]) -> float | None:
     return float(np.degrees(ALIKE_PX * np.mean(sizes))) if sizes else None
 
 
+def equal_views(merged: Merged) -> str:
+    """How many equal views a map's light is the mean of: 1 over the sum of squared shares, weighted by the light."""
+    light = latlong_solid_angles(*merged.seen.shape) * np.maximum(merged.rgb.mean(-1), 0) * (merged.share.sum(0) > 0)
+    squares = float((light * (merged.share**2).sum(0)).sum())
+    return f"{float(light.sum()) / squares if squares > 0 else 1.0:.4g}"
+
+
 def sum_of(share: np.ndarray, maps: list[np.ndarray]) -> np.ndarray:
     """Sum (H, W, C) of maps (H, W, C) times shares (V, H, W)."""
     return np.asarray(sum(part[..., None] * one for part, one in zip(share, maps, strict=True)), float)
