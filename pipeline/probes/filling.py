@@ -32,8 +32,8 @@ BINS = 6
 class Prior:
     """Relative standard error (B,) of the fill at distances (B,) [rad] from the nearest seen texel, ascending.
 
-    ``light_sigma_rel``: of the gap's whole light; ``trials``: gaps it comes from, 0 when the gap is too wide for
-    any and the map's contrast stands in; ``lamps``: further trials that uncovered a lamp.
+    ``light_sigma_rel``: of the gap's whole light; ``trials``: gaps it comes from, 0 when too few could
+    be tried and the map's contrast stands in; ``lamps``: further trials that uncovered a lamp.
     """
 
     distance_rad: np.ndarray
@@ -105,6 +105,8 @@ def _trials(rgb: np.ndarray, kept: np.ndarray) -> tuple[list[np.ndarray], list[n
     floor = np.maximum(DARK * np.median(rgb[~gap], axis=0), 1e-12) if not gap.all() else 1e-12
     for trial in _turned(gap) if gap.any() else ():
         hole = trial & ~gap
+        if not hole.any():  # a small gap that, tilted, holds the centre of no cell
+            continue
         if (solid[..., 0] * hole).sum() < CLEAR * (solid[..., 0] * trial).sum():
             continue
         guess = fill(rgb, kept * ~trial)[hole]
@@ -215,7 +217,7 @@ def reason(figures: dict[str, float | int], error: Prior | None) -> dict[str, An
         source = (
             f"error from {error.trials} gaps of the same shape in what was seen"
             if error.trials
-            else "the gap is too wide for trials: the map's own contrast is its error"
+            else "too few gaps of its shape could be tried: the map's own contrast is its error"
         )
         because = f"{figures['filled_fraction']:.2%} of the sphere was not seen; {source}"
         chance = f"; {error.lamps} further trials uncovered a lamp" if error.lamps else ""
