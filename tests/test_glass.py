@@ -15,12 +15,13 @@ from pipeline.light.environment import resize_environment
 from pipeline.light.harmonics import COSINE_LOBE, sh9_of_environment
 from pipeline.light.prediction import ball_directions, ball_reflectance
 from pipeline.probes import mirror_ball, reflection
-from pipeline.probes.glass import Glass, leaving, unghosted
+from pipeline.probes.ball_evidence import shape
+from pipeline.probes.glass import MOST, Glass, leaving, unghosted
 from pipeline.probes.glass_thickness import LEAST, judge, worth_measuring
 from pipeline.probes.mirror_ball import MirrorBall, stated_glass
-from pipeline.probes.observation import Grid, Observation, Shots
+from pipeline.probes.observation import Grid, Observation, Shots, ViewMap
 from pipeline.probes.parallax import mirrored_directions
-from pipeline.run.errors import CaptureError
+from pipeline.run.errors import CaptureError, NumericalError
 from pipeline.types import Raster, View
 
 RATIO, THICK = 1 / 8, 0.03
@@ -261,6 +262,27 @@ def test_stated_glass_is_kept_and_doubted():
     assert untested.glass is None
     assert untested.evidence[0]["because"] == "nothing is mirrored"
     assert "1.9" in untested.evidence[0]["could_cost"]  # 3 % of the radius, as gazing balls have
+
+
+def test_glass_at_the_most_that_is_searched_leaves_finite_figures():
+    """Beyond 1 - 1/n = 34 % of the radius `Glass` has no turn: NaN, that every comparison would take for no error."""
+    clipped = judge(None, {"a": (MOST, 0.03, 0.5)}, "")
+    assert clipped.glass == Glass(MOST)
+    below = Glass(MOST).displacement()[0] - Glass(MOST - 0.03).displacement()[0]
+    assert clipped.direction_sigma_rad == pytest.approx(below)  # nothing lies above, so what lies below speaks
+    assert any("30% of the radius, the most that is searched" in text for text in clipped.warnings)
+    thin = judge(Glass(0.02), {"a": (MOST, 0.001, 0.5)}, "")  # error 0.28, and twice of it would be beyond
+    wide = judge(None, {"a": (0.2, 0.09, 0.5)}, "")  # not significant, and two sigma above lie at 38 %
+    for one in (clipped, thin, wide):
+        assert np.isfinite(one.direction_sigma_rad)
+        assert "nan" not in one.evidence[0]["could_cost"]
+    assert not wide.warnings
+
+
+def test_directions_of_unknown_error_are_no_good_directions():
+    view = ViewMap(*(np.ones((32, 64, 3)),) * 2, np.ones((32, 64)), np.ones((32, 64)))
+    with pytest.raises(NumericalError, match="needed finite figures"):
+        shape({"a": view}, {}, np.nan)
 
 
 def test_glass_as_thick_as_the_ball_is_refused():

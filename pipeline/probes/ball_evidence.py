@@ -15,6 +15,7 @@ from pipeline.probes.ball_surface import GLOSS_SIGMA, Measured, Surface, decide,
 from pipeline.probes.finding import Found
 from pipeline.probes.glass import Glass
 from pipeline.probes.observation import Shots, ViewMap
+from pipeline.run.errors import NumericalError
 from pipeline.transport.conductors import preset
 from pipeline.types import Raster
 
@@ -91,7 +92,8 @@ def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_sigma: float
     """What dents, and glass whose thickness leaves directions open by ``glass_sigma`` [rad], do to the views' maps.
 
     Dents are one ball's, so the view that shows most of them speaks for all; two views that agree better than that
-    refute it. Directions that are off by more than `ball_shape.TOO_DENTED` leave nine harmonics and no more.
+    refute it. Directions that are off by more than `ball_shape.TOO_DENTED` leave nine harmonics and no more. Raises
+    NumericalError when nothing finite is known of how far they are off.
     """
     numbers: dict[str, Any] = {name: dent_numbers(one) for name, one in dented.items()}
     names, warnings = list(maps), []
@@ -103,6 +105,11 @@ def shape(maps: dict[str, ViewMap], dented: dict[str, Dents], glass_sigma: float
     numbers["second_view_direction_deg"] = {name: float(np.degrees(value)) for name, value in bounds.items()}
     evidence = [dent_reason(dented, sigma, seen)]
     total = float(np.hypot(sigma, glass_sigma))
+    if not np.isfinite(total):  # every comparison with it would say: not dented
+        raise NumericalError(
+            f"ball: directions that it mirrors are off by {np.degrees(sigma):.2g} degrees by dents and "
+            f"{np.degrees(glass_sigma):.2g} by its glass, needed finite figures; state probe.glass_mm or probe.material"
+        )
     numbers["direction_sigma_deg"] = float(np.degrees(total))
     too_dented = total > ball_shape.TOO_DENTED
     if sigma > 0:

@@ -172,7 +172,12 @@ def judge(
             f"the ball is taken to be of glass, silvered inside: {said}; state probe.glass_mm, or probe.material if it "
             "is metal"
         )
-    at_most = max(thick, 0) + 2 * sigma if usable else TYPICAL
+    if any(one[0] >= MOST for one in usable.values()):
+        warnings.append(
+            f"glass before the ball's mirror measures {MOST:.0%} of the radius, the most that is searched: that is no "
+            "measure of it; state probe.glass_mm, or probe.material if it is metal"
+        )
+    at_most = min(max(thick, 0) + 2 * sigma, MOST) if usable else TYPICAL
     rms, rim = np.degrees(Glass(at_most).displacement())
     cost = f"directions off by {rms:.2f} degrees rms, {rim:.1f} at the rim, for {at_most:.1%} of glass"
     shown = Glass(at_most) if glass is None else glass
@@ -180,9 +185,18 @@ def judge(
         **{name: float(np.degrees(way)) for name, way in zip(("rms", "rim"), shown.displacement(), strict=True)},
         "thickness": shown.thickness,
     }
-    unsure = 0.0 if glass is None else Glass(glass.thickness + error).displacement()[0] - glass.displacement()[0]
+    unsure = 0.0 if glass is None else direction_sigma(glass, error)
     row = {"term": "glass before the ball's mirror", "modelled": glass is not None, "because": said, "could_cost": cost}
     return GlassEvidence(glass, unsure, {"glass": numbers}, warnings, [row])
+
+
+def direction_sigma(glass: Glass, error: float) -> float:
+    """Rms [rad] by which directions are off for an ``error`` of the thickness, the worse way; none is above `MOST`."""
+    ways = [
+        Glass(float(np.clip(glass.thickness + side, 0, MOST))).displacement()[0] - glass.displacement()[0]
+        for side in (error, -error)
+    ]
+    return max(abs(way) for way in ways)
 
 
 def _joined(measured: dict[str, tuple[float, float, float]]) -> tuple[float, float]:
