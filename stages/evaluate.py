@@ -23,7 +23,7 @@ from pipeline.conventions import transform_points
 from pipeline.image import metrics
 from pipeline.image.balance import balanced
 from pipeline.image.display import auto_exposure
-from pipeline.image.truth import Truth, load_truth, read_acescg
+from pipeline.image.truth import Truth, load_truth, other_scene, read_acescg
 from pipeline.light import ball_shadow, near_field, prediction
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment
 from pipeline.probes import shadow_flux
@@ -64,17 +64,18 @@ def compute(
     views: dict[str, View], balls: dict[str, BallFit], environment: Raster, plane: Plane, albedo: Raster,
     layers: Raster, composite: Raster, balance: dict[str, Balance], records: dict[str, Any], params: knobs.Evaluate,
 ) -> Result:  # fmt: skip
-    """Metrics (empty without truth), self-check, and the error map (1x1 without truth)."""
+    """Metrics and the error map (empty and 1x1 without truth, or where it shows another scene), and the self-check."""
     photographs = balanced(photographs, balance)
     plate = photographs["plate"].rgb()
     same, fraction = metrics.untouched(composite.rgb(), plate, layers["influence"], layers["obj.A"])
-    numbers = {"untouched_identical": same, "untouched_fraction": fraction}
+    numbers: dict[str, Any] = {"untouched_identical": same, "untouched_fraction": fraction}
     found: dict[str, Any] = {}
     error_map = Raster({"class": np.zeros((1, 1), np.uint32)}, ERROR_MAP.space)
+    truth = load_truth(Path(facts["truth_path"])) if facts.get("truth_path") else None
+    other = other_scene(truth.objects, wishes["object"]) if truth is not None else []
     with ThreadPoolExecutor(1) as pool:  # beside the figures: FLIP leaves Python to others
         checking = pool.submit(self_check, facts, photographs, camera, views, balls, environment, plane, albedo)
-        if facts.get("truth_path"):
-            truth = load_truth(Path(facts["truth_path"]))
+        if truth is not None and not other:
             light = near_field.at_probe(environment.rgb(), environment.attributes, near_field.room_of(facts))
             found, ref, error_map = score(composite.rgb(), plate, truth, params.pixels_per_degree)
             free = (layers["influence"] == 0) & (layers["obj.A"] == 0)
@@ -89,6 +90,9 @@ def compute(
             numbers = {key: value for key, value in found.items() if not isinstance(value, dict)}
         checks = checking.result()
     warnings = exposure_warnings(checks)
+    if other:
+        numbers["other_scene"] = other
+        warnings.append(f"the truth shows another scene: no figures ({'; '.join(other)})")
     warnings += [] if same else ["pixels outside the region of influence differ from the plate; report this"]
     if found.get("non_finite"):
         warnings.append(

@@ -115,6 +115,8 @@ def section(build: Build, name: str) -> dict[str, Any]:
 def headlines(build: Build) -> tuple[list[dict[str, str]], str]:
     """The cards under the picture: errors against truth beside doing nothing, or what could be checked without it."""
     if not build.metrics:
+        if other := (build.records.get("evaluate", {}).get("numbers") or {}).get("other_scene"):
+            return checks(build), f"The truth shows another scene, so there are no figures: {'; '.join(other)}."
         return checks(build), "No truth is known for this capture: these are predictions of what really stood there."
     cards, nothing = [], build.metrics.get("do_nothing", {})
     for key, name, good, fair in TARGETS:

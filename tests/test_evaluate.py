@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.camera.rigid import rotation_exp
-from pipeline.image.truth import load_truth, read_acescg
+from pipeline.image.truth import load_truth, other_scene, read_acescg
 from pipeline.run import formats
 from pipeline.run.errors import ArtifactError, ManifestError
 from pipeline.types import Raster
@@ -52,6 +52,35 @@ def test_perfect_result_scores_perfectly(everything, tmp_path):
     assert found["albedo_gain"] == pytest.approx(1)
     assert found["shadow_outside_region"] == 0
     assert set(found["probe_irradiance_rel_err_of"]) == {"+x", "-x", "+y", "-y", "+z", "-z"}
+
+
+CUBE = {"name": "cube", "sha256": "ab", "position_m": [0.1, 0.05], "yaw_deg": 0.0}
+WISHED = {**CUBE, "lift_m": 0.0, "scale": 1.0, "material": None}
+
+
+def test_a_truth_of_another_scene_gives_no_figures(everything, tmp_path):
+    facts = with_truth(everything, tmp_path)
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"objects": [CUBE]}))
+    same = run(everything, facts=facts, wishes={"object": [WISHED]})
+    assert "other_scene" not in same.numbers
+    assert same.outputs["metrics"]["object_rel_err"] < 1e-4
+    lifted = run(everything, facts=facts, wishes={"object": [{**WISHED, "lift_m": 0.1}]})
+    assert lifted.outputs["metrics"] == {}
+    assert lifted.outputs["error_map"].shape == (1, 1)
+    assert lifted.numbers["other_scene"] == ["cube: lift_m is 0.1, there 0"]
+    assert any(line.startswith("the truth shows another scene: no figures") for line in lifted.warnings)
+
+
+def test_what_of_a_scene_differs_from_the_truths():
+    other = {**CUBE, "name": "ring", "sha256": "cd"}
+    assert other_scene(None, [WISHED]) == []  # nobody says
+    assert other_scene([other, CUBE], [{**WISHED, "name": "box", "yaw_deg": 360.0}, other]) == []
+    assert other_scene([CUBE], []) == ["cube is in it alone"]
+    assert other_scene([CUBE], [WISHED, other]) == ["ring is not in it"]
+    changed = {**WISHED, "sha256": "ef", "position_m": [0.1, 0.06], "material": {"conductor": "gold"}}
+    words = ["cube: another file", "cube: position_m is 0.1, 0.06, there 0.1, 0.05", "cube: another material"]
+    assert other_scene([CUBE], [changed]) == words
 
 
 def test_object_error_is_what_it_is(everything, tmp_path):

@@ -10,6 +10,7 @@ Read from a ``truth.json`` (only `stages/evaluate.py` opens it, after everything
     environment {"file", "world_from_map"}: lat-long, formula of conventions; 3x3 rotation of its directions to world
     camera      {width height fx fy cx cy distortion}, first pixel centre (0.5, 0.5)
     views       {name: {"world_from_camera": 4x4}}
+    objects     what ``with_objects`` shows, optional: [{name sha256 position_m yaw_deg lift_m scale}], as scene.toml
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ from pipeline.image.colour import (
 from pipeline.run import formats
 from pipeline.run.errors import ArtifactError, ManifestError
 
+PLACED = {"position_m": (0.0, 0.0), "yaw_deg": 0.0, "lift_m": 0.0, "scale": 1.0}  # where an object stands; defaults
+SAME_PLACE = 1e-6  # a micrometre: what digits of a text may leave out, far below a pixel
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -48,6 +52,7 @@ class Truth:
     world_from_map: np.ndarray = field(default_factory=lambda: np.eye(3))
     camera: dict[str, Any] = field(default_factory=dict)
     views: dict[str, np.ndarray] = field(default_factory=dict)  # (4, 4) world_from_camera
+    objects: list[dict[str, Any]] | None = None  # what with_objects shows; None: nobody says
 
 
 def load_truth(path: Path) -> Truth:
@@ -80,7 +85,53 @@ def load_truth(path: Path) -> Truth:
         world_from_map=np.asarray(light.get("world_from_map", np.eye(3)) if light else np.eye(3), float),
         camera=facts.get("camera", {}),
         views={n: np.asarray(v["world_from_camera"], float) for n, v in facts.get("views", {}).items()},
+        objects=facts.get("objects"),
     )
+
+
+def other_scene(shown: list[dict[str, Any]] | None, wished: list[dict[str, Any]]) -> list[str]:
+    """What is wished otherwise than the truth's picture shows it, one phrase each; none where nobody says.
+
+    Order and names do not matter: objects are alike by file and placement, lengths to `SAME_PLACE`, in metres, degrees.
+    """
+    if shown is None:
+        return []
+    left = list(shown)
+    strangers = []
+    for wish in wished:
+        alike = next((i for i, one in enumerate(left) if not _unlike(one, wish)), None)
+        if alike is None:
+            strangers.append(wish)
+        else:
+            left.pop(alike)
+    said = []
+    for wish in strangers:
+        same = next((one for one in left if one["name"] == wish["name"]), None)
+        if same is None:
+            said.append(f"{wish['name']} is not in it")
+        else:
+            left.remove(same)
+            said += [f"{wish['name']}: {text}" for text in _unlike(same, wish)]
+    return said + [f"{one['name']} is in it alone" for one in left]
+
+
+def _unlike(shown: dict[str, Any], wish: dict[str, Any]) -> list[str]:
+    """Facts of one object that differ, as words."""
+    found = []
+    if shown.get("sha256") != wish.get("sha256"):
+        found.append("another file")
+    for key, default in PLACED.items():
+        ours, theirs = wish.get(key, default), shown.get(key, default)
+        apart = np.abs(np.subtract(ours, theirs, dtype=float))
+        if np.any((np.minimum(apart % 360, -apart % 360) if key == "yaw_deg" else apart) > SAME_PLACE):
+            found.append(f"{key} is {_digits(ours)}, there {_digits(theirs)}")
+    if shown.get("material") != wish.get("material"):
+        found.append("another material")
+    return found
+
+
+def _digits(value: Any) -> str:
+    return ", ".join(f"{number:g}" for number in np.ravel(value))
 
 
 def _coverage(file: Path, names: list[str] | None, path: Path) -> dict[str, np.ndarray]:

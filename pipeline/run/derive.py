@@ -87,6 +87,8 @@ def print_summary(build: Build) -> str:
         for key, text in HEADLINES.items():
             lines.append(f"{text:<38} {_figure(metrics.get(key)):>9} {_figure(nothing.get(key)):>14}")
         lines.append(f"{'untouched pixels identical':<38} {metrics.get('untouched_identical')!s:>9}")
+    elif other := ((build.record("evaluate") or {}).get("numbers", {})).get("other_scene"):
+        lines += ["", f"the truth shows another scene: no figures ({'; '.join(other)})"]
     elif build.record("evaluate"):
         lines += ["", "no truth is given: the report's self-check predicts what really stood there"]
     stated = (build.record("uncertainty") or {}).get("numbers", {})

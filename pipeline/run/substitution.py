@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.conventions import ACESCG, latlong_directions, latlong_from_direction
 from pipeline.image.metrics import box, scale_of
-from pipeline.image.truth import Truth, load_truth
+from pipeline.image.truth import Truth, load_truth, other_scene
 from pipeline.light import near_field
 from pipeline.light.sampling import bilinear, planes
 from pipeline.run.errors import ManifestError
@@ -59,7 +59,7 @@ def true_albedo(values: Values, truth: Truth, build: Build) -> Raster:
     rgb = np.where(truth.albedo[..., 3:] > 0.5, truth.albedo[..., :3], np.nan)
     picture = Raster({**Raster.split(rgb), "mask": np.zeros(rgb.shape[:2], np.uint32)}, ACESCG)
     params = build.knobs["reflectance"].model_validate(build.settings.params["reflectance"])
-    shape = texture_size(values["plane"], params.texture_px)  # type: ignore[attr-defined]
+    shape = texture_size(values["plane"], params.texture_px)
     texture = read_plate(picture, values["camera"], values["views"]["plate"], values["plane"], shape)
     seen = np.zeros(shape)
     seen[texture.window] = texture.seen
@@ -91,6 +91,10 @@ def waterfall(build: Build, names: list[str], tell: Callable[[str], None]) -> di
     if not path:
         raise ManifestError("--with-truth: this capture has no truth; name it in capture.toml")
     truth = load_truth(Path(path))
+    if other := other_scene(truth.objects, values["wishes"]["object"]):
+        raise ManifestError(
+            f"--with-truth: the truth shows another scene ({'; '.join(other)}); undo that in scene.toml"
+        )
     sets = [[], *([name] for name in names), *([names] if len(names) > 1 else [])]
     result = {}
     for chosen in sets:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import io
 import json
 from collections.abc import Iterator
@@ -234,6 +235,19 @@ def write_manifests(scene: SimulatedScene, out: Path) -> None:
     )
 
 
+def shown_objects(scene: SimulatedScene, out: Path) -> list[dict[str, Any]]:
+    """What truth/with_objects.exr shows: each object's file, by its digest, and its place."""
+    return [
+        {
+            "name": model.name,
+            "sha256": hashlib.sha256((out / "objects" / f"{model.name}.glb").read_bytes()).hexdigest(),
+            "position_m": list(model.position_m),
+            "yaw_deg": model.yaw_deg,
+        }
+        for model in scene.object
+    ]
+
+
 def truth_record(
     scene: SimulatedScene, shoot: Shoot, views: dict[str, np.ndarray], ball_centre: np.ndarray, noise: dict[str, float]
 ) -> dict[str, Any]:
@@ -272,6 +286,7 @@ def truth_record(
             "color_matrix": sensor.color_matrix.tolist(),
             "hot_pixels": [{"row": int(r), "column": int(c), "e_per_s": float(e)} for r, c, e in hot],
         },
+        "objects": shown_objects(scene, shoot.out),
         "exposures": shoot.exposures,
         **({"leaves": leaves} if (leaves := scene.leave.model_dump(exclude_defaults=True)) else {}),
         "noise": noise,

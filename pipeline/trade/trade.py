@@ -7,6 +7,7 @@ Rows, pages and the list of what failed lie in ``trade/`` of the build folder; n
 from __future__ import annotations
 
 import functools
+import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -133,6 +134,10 @@ def prepared(asked: Asked, root: Path, say: Say) -> tuple[str, Session, Point]:
     build = Build(asked.graph, root / "source", settings, asked.models)
     against, (source, facts) = asked.against, source_of(build, asked.against)
     truth = facts.get("truth_path")
+    if truth and (other := strange(Path(truth), build)):
+        if against == "truth":
+            raise ManifestError(f"--against: is truth, which shows another scene ({'; '.join(other)}); take final")
+        truth = None
     if against == "truth" and not truth:
         raise ManifestError("--against: is truth; this capture names none; take final, or add truth to capture.toml")
     if not against:
@@ -151,6 +156,15 @@ def prepared(asked: Asked, root: Path, say: Say) -> tuple[str, Session, Point]:
     if asked.reuse:
         bench.adopt(asked.out, base)
     return against, Session(bench, say, asked.reuse), base
+
+
+def strange(truth: Path, build: Build) -> list[str]:
+    """What is wished otherwise than the truth's picture shows it."""
+    from pipeline.image.truth import other_scene
+    from pipeline.run.artifacts import WISHES
+
+    shown = json.loads(truth.read_bytes()).get("objects")
+    return other_scene(shown, build.value(WISHES)["object"]) if shown is not None else []
 
 
 def judge_of(root: Path, against: str, truth: str | None) -> Callable[[Path], dict[str, float | None]]:
