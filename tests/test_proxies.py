@@ -156,6 +156,19 @@ def test_masks_are_read_alike_from_every_kind_of_picture(tmp_path):
         np.testing.assert_allclose(formats.read_mask(file), GREY, atol=0.5 / 255, err_msg=file.name)
 
 
+def test_a_cropped_mask_is_zero_around_its_crop(tmp_path):
+    """As a compositor's autocrop writes it: grey and opaque where there are data, nothing around."""
+    whole = np.zeros((5, 7), np.float32)
+    whole[1:4, 2:6] = GREY
+    layers = dict.fromkeys("RGB", whole) | {"A": np.ones_like(whole)}
+    formats.write_exr(tmp_path / "crop.exr", Raster(layers, "data", {"dataWindow": ((2, 1), (5, 3))}))
+    assert np.array_equal(formats.read_mask(tmp_path / "crop.exr"), whole)
+    layers["A"] = np.where(whole > 0.5, 1, 0).astype(np.float32)
+    formats.write_exr(tmp_path / "crop.exr", Raster(layers, "data", {"dataWindow": ((2, 1), (5, 3))}))
+    with pytest.raises(ArtifactError, match="4 channels differ"):
+        formats.read_mask(tmp_path / "crop.exr")
+
+
 def test_masks_that_say_two_things_are_refused(tmp_path):
     alpha = np.full((3, 4, 4), 255, np.uint8)
     alpha[0, 0, 3] = 0

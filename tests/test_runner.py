@@ -341,6 +341,16 @@ def test_what_a_stage_stores_in_16_bit_lies_so_on_disk_and_is_the_same_in_memory
         assert np.array_equal(read[name], kept[name])
 
 
+def test_memory_has_the_attributes_that_the_file_is_read_with(tmp_path):
+    """A window of the picture is how it lies on disk; what the stage says of the picture passes either way."""
+    said = {"dataWindow": ((1, 0), (1, 0)), "insitu:unit": "1", "envmap": "latlong"}
+    value = settle(SIGN, Raster({"Y": np.array([[0.0, 2.0]], np.float32)}, "data", said))
+    formats.write(tmp_path, SIGN, value)
+    read, kept = formats.read(tmp_path, SIGN), as_read(value)
+    assert kept.attributes == read.attributes == {"insitu:unit": "1", "envmap": "latlong"}
+    assert np.array_equal(read["Y"], kept["Y"])
+
+
 def test_changed_code_runs_again(folder, monkeypatch):
     run(folder)
     monkeypatch.setattr(closure, "digest", lambda module: "other code")

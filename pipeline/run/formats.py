@@ -24,6 +24,11 @@ from pipeline.types import Raster
 
 AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+# Attributes of how an EXR lies on disk: a reader of the picture gets none of them.
+LAYOUT = frozenset(
+    ("compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio", "screenWindowCenter",
+     "screenWindowWidth")
+)  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -108,10 +113,11 @@ def write_exr(path: Path, raster: Raster, half: bool = False) -> None:
             raise OSError(str(error).replace(str(scratch), path.name)) from error
 
 
-def read_exr(path: Path, space: str | None = None) -> Raster:
+def read_exr(path: Path, space: str | None = None, without_opaque: bool = False) -> Raster:
     """Read an EXR, all channels as stored (half widened to float32).
 
-    The picture is that of its display window: zero where there are no data, cut where data lie beyond it.
+    The picture is that of its display window: zero where there are no data, cut where data lie beyond it. An alpha that
+    is 1 wherever there are data is dropped if ``without_opaque``.
     ``space`` None takes what the file says. Raises ArtifactError when it cannot be read, or its space is another one.
     """
     import OpenEXR
@@ -121,6 +127,8 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header, pixels = dict(file.header()), file.channels()  # closing the file empties its header
+            if without_opaque and "A" in pixels and len(pixels) > 1 and np.all(np.asarray(pixels["A"].pixels) == 1):
+                del pixels["A"]
             channels = {
                 name: displayed(np.asarray(c.pixels, np.uint32 if c.pixels.dtype == np.uint32 else np.float32), header)
                 for name, c in pixels.items()
@@ -134,8 +142,7 @@ def read_exr(path: Path, space: str | None = None) -> Raster:
         found = space_of_chromaticities(header.get("chromaticities"))
     if space is not None and found is not None and found != space:
         raise ArtifactError(f"{path}: colour space is {found}, expected {space}; re-run the stage that writes it")
-    known = {"compression", "type", "channels", "insitu:space", "dataWindow", "displayWindow"}
-    known |= {"lineOrder", "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth"}
+    known = {*LAYOUT, "type", "channels", "insitu:space"}
     if found not in (None, "unknown"):
         known.add("chromaticities")  # primaries without a name stay in the attributes
     return Raster(channels, found or space or "unknown", {k: v for k, v in header.items() if k not in known})
@@ -259,11 +266,12 @@ def _read_radiance(path: Path) -> Raster:
 def read_mask(path: Path) -> np.ndarray:
     """Coverage (H, W) float32 in [0, 1] of a mask picture, .png (8 or 16 bit) or .exr: 1 in front, 0 not.
 
-    Grey, or a colour picture whose channels agree; an alpha of 1 throughout says nothing and is dropped. Raises
+    Grey, or a colour picture whose channels agree; an alpha of 1 throughout says nothing and is dropped; so is one that
+    is 1 within a crop (an EXR's data window), outside which the mask is 0. Raises
     ArtifactError when the picture cannot be read, is ambiguous, or leaves [0, 1].
     """
     if path.suffix.lower() == ".exr":
-        named = read_exr(path).channels
+        named = read_exr(path, without_opaque=True).channels
     else:
         stored = _decode(path)
         planes = np.atleast_3d(stored.astype(np.float32) / np.iinfo(stored.dtype).max)

@@ -309,7 +309,8 @@ def as_read(value: Any) -> Any:
     """A settled value exactly as a later process reads it back: one process and many come to the same bytes."""
     if isinstance(value, Raster):
         wide = {n: v.astype(np.float32) if v.dtype == np.float16 else v for n, v in value.channels.items()}
-        return Raster(wide, value.space, value.attributes)
+        said = {name: v for name, v in value.attributes.items() if name not in formats.LAYOUT}
+        return Raster(wide, value.space, said)
     if isinstance(value, dict) and any(isinstance(part, Raster) for part in value.values()):
         return {name: as_read(part) for name, part in value.items()}
     return value
