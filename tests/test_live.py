@@ -297,6 +297,20 @@ def test_a_stage_near_its_end_is_not_kept_from_it(monkeypatch, tmp_path):
     assert shown_of(9.0, tmp_path) == []
 
 
+def test_a_resumed_stage_shows_pictures_while_much_is_left(monkeypatch, tmp_path):
+    """540 s before the checkpoint, 60 s after it: its rate is that of all 600, not of the seconds since."""
+    monkeypatch.setattr(live, "OFFER_EVERY_S", 3.0)
+    monkeypatch.setattr(live, "OFFER_LEFT_S", 10.0)
+    clock, shown = Clock(), []
+    host = Live("toy", Stop(), tmp_path / "c.npz", "digest", lambda *_: shown.append(clock.now - 100.0), clock)
+    host.before = np.array([540.0, 540.0])
+    for second in range(1, 61):
+        clock.now = 100.0 + second
+        host.told(0.9 + 0.1 * second / 60)
+        host.offer(lambda: Result({}))
+    assert shown == [float(second) for second in range(1, 50, 3)]  # every 3 s until 10 s are left
+
+
 def shown_of(seconds: float, folder: Path) -> list[float]:
     """When a stage of so many seconds, told and offered twenty times, is shown."""
     clock, shown = Clock(), []

@@ -103,8 +103,8 @@ class Live(progress.Host):
         self.share = share
 
     def left(self) -> float:
-        """Seconds to the end at the mean rate so far; infinite while no share was told."""
-        return (self.clock() - self.start) * (1 - self.share) / self.share if self.share > 0 else np.inf
+        """Seconds to the end at the mean rate so far, a checkpoint's included; infinite while no share was told."""
+        return float(self.spent()[0]) * (1 - self.share) / self.share if self.share > 0 else np.inf
 
     def offer(self, make: Callable[[], Result]) -> None:
         """Show the result when one is due, and the end is not near."""
@@ -147,5 +147,5 @@ class Live(progress.Host):
             return
         arrays = {**make(), DIGEST: np.array(self.digest), SPENT: self.spent()}
         with formats.atomic_path(self.checkpoint) as scratch, scratch.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **arrays)
         self.saves.spent(start, self.clock())

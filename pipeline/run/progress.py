@@ -67,10 +67,10 @@ def report(what: str, share: float) -> None:
 def offer(make: Callable[[], Result]) -> None:
     """Offer what the stage would return if it ended now: every output, whole, of its final size.
 
-    ``make`` is called only when someone will look, so offer as often as results improve. The first offer always goes
-    through; later ones when seconds have passed and showing them stays within a tenth of the stage's time. None does
-    when, by the share that was reported, the stage is done in seconds anyway. A stage that has offered is asked by
-    `interrupted` instead of being broken off.
+    ``make`` is called only when someone will look, so offer as often as results improve. The first offer goes through
+    at once; later ones when seconds have passed and showing them stays within a tenth of the stage's time. None does,
+    the first no more than others, when by the share that was reported the stage is done in seconds anyway. A stage that
+    has offered is asked by `interrupted` instead of being broken off.
     """
     _host.get().offer(make)
 
