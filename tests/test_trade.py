@@ -7,6 +7,7 @@ import itertools
 import json
 import shutil
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,6 +100,12 @@ def test_singles_leave_the_base_out():
     ]  # fmt: skip
     assert found[-1].switches == ["composite.kind=ratio"]
     assert Point("", "", "", (("render.denoise", False),)).switches == ["render.denoise=false"]
+
+
+def test_a_source_of_the_pose_is_tried_only_where_there_are_further_views():
+    knobs = ["render.depth", "sources.cloud"]
+    assert points.without_effect(knobs, views=True) == {}
+    assert list(points.without_effect(knobs, views=False)) == ["sources.cloud"]
 
 
 def test_unknown_knobs_are_refused():
@@ -414,6 +421,24 @@ def test_a_point_that_was_killed_is_tried_again_next_time(toy):
     large = Point("render.samples=512", "knob", "preview", (("render.samples", 512),))
     assert toy.measure(large)["failed"] == "killed by signal 9"
     assert toy.known(large) is None
+
+
+def test_a_relative_folder_is_meant_from_where_the_command_was_given(toy, tmp_path, monkeypatch):
+    """The process of a point has another working folder; what it is told must not depend on it."""
+    told = []
+
+    class Child:
+        def __init__(self, words, **rest):
+            told.extend(words)
+
+        def wait(self):
+            return 0
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(work.subprocess, "Popen", Child)
+    work.Bench._run(toy, Point("preview", "base", "preview"), Path("out/trade/work/one"))
+    assert told[told.index("--out") + 1] == str((tmp_path / "out/trade/work/one").resolve())
+    assert (tmp_path / "out/trade/work/one/log.txt").exists()
 
 
 def test_interrupted_keeps_what_is_done(toy):

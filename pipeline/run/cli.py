@@ -220,8 +220,9 @@ def dispatch(args: argparse.Namespace) -> int:
 
 def trading(args: argparse.Namespace) -> int:
     """Measure the trade of a capture."""
+    from pipeline.run.manifest import load_capture
     from pipeline.run.settings import resolve
-    from pipeline.trade.points import chosen_knobs
+    from pipeline.trade.points import chosen_knobs, without_effect
     from stages.knobs import KNOBS, PRESETS
 
     if args.repeats < 0:
@@ -232,6 +233,10 @@ def trading(args: argparse.Namespace) -> int:
 
     knobs = chosen_knobs(args.knobs)
     settle(args.quality, [])
+    idle = without_effect(knobs, load_capture(args.capture)[0].views is not None)
+    for knob, because in idle.items():
+        say(f"{knob}: not tried, {because}")
+    knobs = [knob for knob in knobs if knob not in idle]
     from pipeline.trade.trade import Asked, trade
     from stages.order import graph
 

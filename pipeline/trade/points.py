@@ -18,6 +18,7 @@ LADDERS: dict[str, tuple[Any, ...]] = {
     "merge.weights": ("poisson", "optimal"),
     "merge.estimate_exposures": (False, True),
     "develop.demosaic": ("bilinear", "malvar", "menon"),
+    "sources.cloud": ("never", "auto", "always"),  # source of the pose, where further views are given
     "probe.width": (256, 512, 1024, 2048),
     "probe.supersample": (1, 3, 4),
     "lights.min_share": (1.0, 0.1, 0.02, 0.005),  # 1: no light is told from the sky
@@ -90,6 +91,11 @@ def chosen_knobs(text: str | None) -> list[str]:
     if unknown := [name for name in names if name not in LADDERS]:
         raise ManifestError(f"--knobs: is {', '.join(unknown)}; expected names of {', '.join(LADDERS)}")
     return names
+
+
+def without_effect(knobs: Iterable[str], views: bool) -> dict[str, str]:
+    """Of these knobs, those that can change nothing in a capture, and why. ``views``: whether it has further views."""
+    return {knob: "the capture has no further views" for knob in knobs if knob == "sources.cloud" and not views}
 
 
 def design(factors: int) -> list[tuple[bool, ...]]:
