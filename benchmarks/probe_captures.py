@@ -86,7 +86,10 @@ def orthographic(photograph: Raster, camera: Camera, view: View, ball: BallFit, 
 def measure(capture: Path, out: Path) -> dict[str, Any]:
     """Errors of the capture's map, and of the orthographic peer on its first ball."""
     folder = built(capture, out)
-    read = lambda stage, artifact: formats.read(folder / stage, artifact)  # noqa: E731  five reads of one folder
+
+    def read(stage: str, artifact: A.Artifact) -> Any:
+        return formats.read(folder / stage, artifact)
+
     facts, camera, views = read("ingest", A.FACTS), read("calibrate", A.CAMERA), read("pose", A.VIEWS)
     photographs, balls = read("develop", A.PHOTOGRAPHS), read("probe", A.BALLS)
     truth = load_truth(Path(facts["truth_path"]))

@@ -45,7 +45,7 @@ class Raster:
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""
-        return next(iter(self.channels.values())).shape  # type: ignore[return-value]
+        return next(iter(self.channels.values())).shape
 
     def rgb(self, layer: str = "") -> np.ndarray:
         """(H, W, 3) float32 of the layer: ``""`` reads R G B, ``"variance"`` reads variance.R and so on."""

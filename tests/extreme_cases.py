@@ -17,7 +17,6 @@ import pytest
 
 TABLE = Path(__file__).parent / "extremes/cases.toml"
 CASES: dict[str, dict[str, Any]] = {row["id"]: row for row in tomllib.loads(TABLE.read_text())["case"]}
-OUTCOMES = ("exact", "degraded", "refused")
 Saw = Callable[..., None]
 
 

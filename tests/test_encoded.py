@@ -313,7 +313,10 @@ def test_real_brackets_go_through_the_whole_merge(name, every, largest, step):
     """Sixteen frames of film; twelve of a hand-held corridor. Nothing is lost, steps are found, motion is said."""
     frames, codes = real(name, every, largest)
     linear = linearise({"plate": Bracket(name="plate", role="plate", frames=frames)}, lambda f: codes[f.file])
-    decode = lambda f: merge.Decoded(linear.samples(f, codes[f.file]))  # noqa: E731
+
+    def decode(frame: Frame) -> merge.Decoded:
+        return merge.Decoded(linear.samples(frame, codes[frame.file]))
+
     result = linear.completed(merge.merge_brackets(linear.brackets, decode, knobs.Merge()))
     raster, numbers = result.outputs["mosaics"]["plate"], result.numbers["views"]["plate"]
     assert numbers["frames"] == len(frames)

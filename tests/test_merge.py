@@ -40,7 +40,10 @@ def bracket(
 
 def run(brackets: list[Bracket], shots: dict[str, merge.Decoded], given: list[dict] | None = None, **options: object):
     tables = [NoiseFacts(**{**SENSOR, **table}).model_dump() for table in (given if given is not None else [{}])]
-    decode = lambda one: shots[one.file]  # noqa: E731
+
+    def decode(one: Frame) -> merge.Decoded:
+        return shots[one.file]
+
     return merge.merge_brackets({b.name: b for b in brackets}, decode, knobs.Merge(**options), given=tables)
 
 

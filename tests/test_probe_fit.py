@@ -75,9 +75,10 @@ def test_radius_is_solved_from_the_plane(shot):
 
 def test_what_chance_reaches_falls_with_the_size_and_grows_with_the_search():
     """The measured law of false alarms: a ball of 57 px that half its azimuths see is one where another view has it."""
-    fit = lambda size, visible=1.0: sphere_fit.SphereFit(  # noqa: E731
-        np.zeros(3), np.eye(3), 0.2, 50, size, 0.8, 0.5, 2.0, visible
-    )
+
+    def fit(size: float, visible: float = 1.0) -> sphere_fit.SphereFit:
+        return sphere_fit.SphereFit(np.zeros(3), np.eye(3), 0.2, 50, size, 0.8, 0.5, 2.0, visible)
+
     ways = [needed_merit(way, fit(57.0)) for way in ("click", "other_view", "plane", "anywhere")]
     assert ways == sorted(ways)
     assert ways[1] < 0.5 < ways[2] < 0.6  # the courtyard's second ball: 0.51, beside the first one's place

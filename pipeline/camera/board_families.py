@@ -77,7 +77,7 @@ def find_markers(grey: np.ndarray, families: Sequence[str] = FAMILIES) -> Marker
         small, scale = cv2.resize(small, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2.0
     detector = cv2.aruco.ArucoDetector([dictionary(name) for name in families], cv2.aruco.DetectorParameters())
     quads, ids, _, which = detector.detectMarkersMultiDict(small)
-    none = Markers("", np.empty(0, int), np.empty((0, 4, 2)), grey.shape)  # type: ignore[arg-type]
+    none = Markers("", np.empty(0, int), np.empty((0, 4, 2)), grey.shape)
     if ids is None or not len(ids):
         return none
     found, family_of = np.ravel(ids), np.ravel(which)
@@ -87,7 +87,7 @@ def find_markers(grey: np.ndarray, families: Sequence[str] = FAMILIES) -> Marker
         return none
     corners = ours(np.concatenate([np.reshape(quad, (4, 2)) for quad in quads])).reshape(-1, 4, 2) / scale
     kept = family_of == best
-    return Markers(families[best], found[kept], corners[kept], grey.shape)  # type: ignore[arg-type]
+    return Markers(families[best], found[kept], corners[kept], grey.shape)
 
 
 def proposed_dictionary(family: str, largest_id: int) -> str:

@@ -17,7 +17,6 @@ from pipeline.run.errors import ManifestError
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between y up, -z forward and y down, z forward
 Y_FROM_Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 LARGEST_DEFECT = 1e-3
 
 

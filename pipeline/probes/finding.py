@@ -173,19 +173,20 @@ def best_fit(
     """The fit, with and without the plane, whose outline most azimuths see; None without any."""
     prior = height if on_plane else None
     picture, variance, valid = measured(photograph)
-    fits = []
+    fits: list[tuple[sphere_fit.SphereFit, sphere_fit.SphereFit]] = []
     for centre, votes, chance in settled(signals, camera, radius, places, prior)[:2]:
         contrast = votes / max(chance, 1e-12)
         pair = sphere_fit.fit_sphere(picture, variance, valid, camera, radius, centre, prior, 0.0, contrast, votes)
         if pair[0].rms_px < MAX_RMS_PX and np.linalg.norm(pair[0].centre) > 1.05 * radius:
-            fits.append(tuple(replace(fit, support=seen(signals, camera, fit, radius)) for fit in pair))
+            fit, free = (replace(one, support=seen(signals, camera, one, radius)) for one in pair)
+            fits.append((fit, free))
 
     def merit(pair: tuple[sphere_fit.SphereFit, sphere_fit.SphereFit]) -> float:
         inside = change_at(signals[0], camera, pair[0].centre, radius, INNER) if len(signals) > 1 else 1.0
         beside = change_at(signals[0], camera, pair[0].centre, radius, (1.1, 1.25)) if len(signals) > 1 else 0.0
         return pair[0].merit * inside / (inside + beside + 1e-12)
 
-    return max(fits, key=merit, default=None)  # type: ignore[arg-type, return-value]
+    return max(fits, key=merit, default=None)
 
 
 def settled(

@@ -81,11 +81,6 @@ def shade(
     return result, figures
 
 
-def _union(masks: list[np.ndarray]) -> np.ndarray:
-    """What any of the masks (H, W) covers; a single zero without any."""
-    return np.asarray(np.max(masks, 0)) if masks else np.zeros((1, 1))
-
-
 def reason(figures: dict[str, dict[str, Any]], views: int) -> dict[str, Any]:
     """Whether anyone was removed, and on what evidence."""
     found = {f"{name} ({whose})": entry.get(f"{whose}_photographer_z", np.nan)

@@ -17,7 +17,6 @@ import numpy as np
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _FORMATS = {BYTE: "B", SHORT: "H", LONG: "I", DOUBLE: "d"}
-_SIZES = {BYTE: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, UNDEFINED: 1, SRATIONAL: 8, DOUBLE: 8}
 _COLOURS = {"R": 0, "G": 1, "B": 2}
 
 Entry = tuple[int, int, object]

@@ -51,7 +51,7 @@ def register(mi: Any) -> None:
     def schlick(cosine: Any) -> Any:
         return dr.power(1.0 - dr.clip(dr.abs(cosine), 0.0, 1.0), 5)
 
-    class GltfBsdf(mi.BSDF):  # type: ignore[misc, name-defined]
+    class GltfBsdf(mi.BSDF):
         """Reflection only; two lobes, diffuse and glossy, sampled by their expected share."""
 
         def __init__(self, props: Any) -> None:

@@ -190,7 +190,8 @@ def lights_of(environment: np.ndarray, coarsest: tuple[int, int] = MAP) -> Light
     grey = power.sum(-1, keepdims=True)
     levels = [(power, grey * latlong_directions(height, width), grey)]
     while levels[-1][0].shape[0] > coarsest[0]:
-        levels.append(tuple(_quarter(part) for part in levels[-1]))  # type: ignore[arg-type]
+        power, moment, grey = (_quarter(part) for part in levels[-1])
+        levels.append((power, moment, grey))
     wanted = np.ones(coarsest, bool)
     direction, kept = [], []
     for number, (power, moment, grey) in enumerate(reversed(levels)):

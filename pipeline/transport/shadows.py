@@ -123,4 +123,5 @@ def _steps(picture: np.ndarray, axis: int) -> np.ndarray:
 def _sides(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Values REACH cells back and REACH cells on along an axis, the border repeated."""
     index = np.arange(values.shape[axis])
-    return tuple(np.take(values, np.clip(index + d, 0, len(index) - 1), axis) for d in (-REACH, REACH))  # type: ignore
+    back, on = (np.take(values, np.clip(index + d, 0, len(index) - 1), axis) for d in (-REACH, REACH))
+    return back, on
