@@ -12,6 +12,7 @@ import staged
 from command import DESK, command, refused
 
 from benchmarks import ask as benchmark
+from pipeline.image import metrics
 from pipeline.run import cli
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build
@@ -20,7 +21,7 @@ from pipeline.trade import ask, model, pilot
 from pipeline.trade.ask import Question
 from pipeline.trade.model import FEWER_TRACED, FINEST, STARTING, Setting
 from pipeline.trade.points import Point
-from pipeline.types import Raster
+from pipeline.types import Emitter, Raster
 from stages.knobs import KNOBS, PRESETS
 from stages.order import graph
 
@@ -33,7 +34,8 @@ RECORD = {
     ],
     "differences": {"2-8": {"object": 0.04, "shadow": 0.07}},
     "map": {"object": 0.002, "shadow": 0.015},
-    "stated": {"object": {"light": 0.004, "exposures": 0.003}, "shadow": {"light": 0.006, model.LAMP: 0.008}},
+    "lamps": {"object": 0.002, "shadow": 0.008}, "flux_sigma": 0.02,
+    "stated": {"object": {"light": 0.004, "exposures": 0.003}, "shadow": {"light": 0.006}},
     "bounds": [{"stage": "probe", "term": "near field", "could_cost": "5 %"}],
     "cpu_seconds": 20.0, "wall_over_cpu": 0.7,
 }  # fmt: skip
@@ -82,13 +84,68 @@ def test_parts_add_as_squares_and_each_falls_with_its_knob():
     for figure, parts in found.parts(Setting(8, 1024)).items():
         assert parts["all"] == pytest.approx(math.hypot(*(value for name, value in parts.items() if name != "all")))
         assert parts["map"] == RECORD["map"][figure] / 2
-        assert parts["lamp"] == (0.004 if figure == "shadow" else 0)
+        assert parts["lamp"] == RECORD["lamps"][figure]  # of every width: no map makes a lamp surer
         assert found.parts(Setting(32, 1024))[figure]["sampling"] == pytest.approx(parts["sampling"] / 2)
     assert found.stated == {"object": pytest.approx(0.005), "shadow": pytest.approx(0.006)}
     costs = [found.seconds(Setting(n, width)) for n, width in ((8, 512), (16, 512), (16, 1024), (512, 2048))]
     assert costs == sorted(costs)
     assert found.left(Setting(8, 512)) == pytest.approx(found.seconds(Setting(8, 512)) - sum(RECORD["stages"].values()))
     assert found.left(Setting(8, 1024)) == pytest.approx(found.seconds(Setting(8, 1024)) - 2.0)  # merge stays
+
+
+def lit_by(lamps: list[float], blocked: list[float]) -> Raster:
+    """Layers under lamps of some irradiance on the ground, of which a shadow blocks shares; an object sees them all."""
+    layers = layered()
+    shadow = metrics.norm(layers.rgb("lost")) > 0
+    flat = np.full((*layers.shape, 3), sum(lamps))
+    lost = -sum(lamp * share for lamp, share in zip(lamps, blocked, strict=True)) * shadow[..., None]
+    parts = {"obj": 0.5 * flat, "lost": lost * np.ones(3), "gained": 0 * flat, "without": flat}
+    channels = {name: values for layer, rgb in parts.items() for name, values in Raster.split(rgb, layer).items()}
+    return Raster(channels | {"obj.A": layers["obj.A"]}, "acescg")
+
+
+def test_what_a_lamps_flux_does_to_objects_and_shadows_is_that_of_a_plate_that_is_photographed():
+    """Of lamps with shares 0.6, 0.3, 0.1 of the light, a shadow blocks all of the first and half of the second.
+
+    Its change is c / B: by finite differences of it, 1e-6 of a lamp's flux. Objects follow by the lamp's share.
+    """
+    lamps, blocked, sigmas = [6.0, 3.0, 1.0], [1.0, 0.5, 0.0], [0.02, 0.05, 0.04]
+    whole = lit_by(lamps, blocked)
+
+    def ratio(light: list[float]) -> float:
+        return sum(lamp * share for lamp, share in zip(light, blocked, strict=True)) / sum(light)
+
+    dark, expected = [], {"object": 0.0, "shadow": 0.0}
+    for index, sigma in enumerate(sigmas):
+        without = [0.0 if other == index else lamp for other, lamp in enumerate(lamps)]
+        more = [lamp * (1 + 1e-6 * (other == index)) for other, lamp in enumerate(lamps)]
+        dark.append((np.full(3, sigma), lit_by(without, blocked)))
+        expected["object"] += (sigma * lamps[index] / sum(lamps)) ** 2
+        expected["shadow"] += (sigma * (ratio(more) / ratio(lamps) - 1) / 1e-6) ** 2
+    found = pilot.by_lamps(whole, dark)
+    assert found["object"] == pytest.approx(math.sqrt(expected["object"]), rel=1e-4)
+    assert found["shadow"] == pytest.approx(math.sqrt(expected["shadow"]), rel=1e-3)
+    alone = pilot.by_lamps(lit_by([6.0], [1.0]), [(np.full(3, 0.5), lit_by([0.0], [1.0]))])
+    assert alone["shadow"] == pytest.approx(0, abs=1e-6)  # the plate says all of it
+    assert alone["object"] == pytest.approx(0.5, rel=1e-6)
+    assert pilot.by_lamps(whole, []) == {"object": 0, "shadow": 0}
+
+
+def test_lamps_that_are_surest_of_all_are_not_rendered_without():
+    def lamp(sigma: float) -> Emitter:
+        about = {"direction": np.array([0.0, 1.0, 0.0]), "solid_angle_sr": 0.01, "half_angle_rad": 0.05}
+        texels = np.array([70, 71, 200])
+        return Emitter(name="lamp", irradiance=np.ones(3), irradiance_sigma=np.full(3, sigma), texels=texels, **about)
+
+    assert pilot.unsure([lamp(s) for s in (0.1, 0.3, 0.01, 0.2, 0.29)]) == [1, 4, 3]
+    assert pilot.unsure([]) == []
+    assert pilot.sigma_of(lamp(0.1)) == pytest.approx(0.1)
+    assert pilot.sigma_of(lamp(math.inf)) == pytest.approx(0)
+    light = staged.artifacts()["environment"]
+    black = pilot.without_lamp(light, lamp(0.1)).rgb().reshape(-1, 3)
+    assert not black[[70, 71, 200]].any()
+    others = np.setdiff1d(np.arange(len(black)), [70, 71, 200])
+    assert (black[others] == light.rgb().reshape(-1, 3)[others]).all()
 
 
 def test_choices_are_the_best_of_all():
@@ -246,6 +303,9 @@ def test_only_what_final_misses_is_refused_and_the_nearest_is_named(asking):
     named = float(str(told.value).split("ask ")[1].split(" or more")[0])
     assert least <= named < least + 1.01e-4
     asking(max_error=named)
+    parts = model.fitted(RECORD).parts(FINEST)
+    for part in parts["object"].keys() - {"all"}:  # whichever is largest, it has words
+        assert ask.largest(parts | {"object": parts["object"] | {part: 0.9, "all": 0.9}}).endswith("in object pixels")
     with pytest.raises(ManifestError, match=r"--time-budget: is 22 CPU seconds; \d+ are needed, of which the pilot"):
         asking(time_budget=22)
     with pytest.raises(ManifestError, match=r"needed for an error of 0\.02.*or allow a larger error"):
@@ -282,12 +342,23 @@ def test_what_a_run_reached_is_noted_from_its_records(desk_build, tmp_path, monk
     samples = build.settings.params["render"]["samples"]
     renders = [{"samples": samples, "noise": numbers["object_noise_rel"] / 2, "cpu_seconds": 1.0, "work": 1.0}]
     predicted = model.fitted(RECORD).parts(Setting(samples, 512))
-    found = ask.posterior(build, predicted, {"renders": renders})
+    sigma = pilot.flux_sigma(build)
+    found = ask.posterior(build, predicted, {"renders": renders, "flux_sigma": sigma / 3})
+    assert found["shadow"]["lamp"] == pytest.approx(3 * predicted["shadow"]["lamp"])  # the run is less sure of it
     assert found["object"]["sampling"] == pytest.approx(2 * predicted["object"]["sampling"])
     assert 0.002 < found["object"]["stated"] < 0.02
     truth = ask.against_truth(build)
     metrics = json.loads((desk_build / "evaluate" / "metrics.json").read_text())
     assert truth == {"object": metrics["object_rel_err"], "shadow": metrics["shadow_change_err"]}
+
+
+def test_what_was_asked_and_not_kept_is_warned_of():
+    reached = {"error": 0.03, "with_pilot_cpu_seconds": 50.0}
+    assert ask.missed({"max_error": 0.03, "time_budget": 50.0}, reached) == []
+    (line,) = ask.missed({"max_error": 0.02}, reached)
+    assert "was 0.02; the run's own records say 0.0300" in line
+    (line,) = ask.missed({"time_budget": 40.0}, reached)
+    assert "was 40 CPU seconds; 50 were taken" in line
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """``--max-error`` and ``--time-budget``: settings for a question, and what became of the prediction, in run.json.
 
-run.json      asked, predicted, reached, settings, and the key of what the answer holds for
+run.json      asked, predicted, reached, settings, warnings, and the key of what the answer holds for
 pilot.json    what the pilot measured, and its key; another question of the same capture takes it
 
 The key is a digest of photographs, wishes, code, libraries and the knobs that the user fixed. The same question of the
@@ -22,7 +22,7 @@ from pipeline.run.runner import Build, is_complete
 from pipeline.run.settings import Settings
 from pipeline.trade import model
 from pipeline.trade.model import FIGURES, FINEST, PILOT_WIDTH, Model, Setting
-from pipeline.trade.pilot import FEW, Pilot, stated
+from pipeline.trade.pilot import FEW, Pilot, flux_sigma, stated
 from pipeline.trade.work import LAST, code_of, digest_of, source_of
 
 RUN, PILOT = "run.json", "pilot.json"
@@ -133,7 +133,7 @@ def check(question: Question, found: Model, setting: Setting, pilot: Mapping[str
         which += f" ({setting.samples} samples, a map of {setting.width} px)"
         raise ManifestError(
             f"--max-error: is {question.max_error:g}; {which}, is predicted to err by {error:.4f}, "
-            f"most of it {largest(found, setting)}; ask {least:g} or more"
+            f"most of it {largest(found.parts(setting))}; ask {least:g} or more"
         )
     if question.time_budget is not None and seconds > question.time_budget:
         where = f" for an error of {question.max_error:g}" if question.max_error is not None else ""
@@ -144,14 +144,14 @@ def check(question: Question, found: Model, setting: Setting, pilot: Mapping[str
         )
 
 
-def largest(found: Model, setting: Setting) -> str:
-    """The largest part of the larger figure, in words."""
-    parts = found.parts(setting)
+def largest(parts: Mapping[str, Mapping[str, float]]) -> str:
+    """The largest part of the larger figure (as `Model.parts` has them), in words."""
     figure = max(parts, key=lambda name: parts[name]["all"])
     name = max((part for part in parts[figure] if part != "all"), key=lambda part: parts[figure][part])
     words = {
         "sampling": "noise of sampling",
         "map": "the map's width",
+        "lamp": "the flux of lamps",
         "stated": "what the photographs leave uncertain",
     }
     return f"{words[name]}, in {figure} pixels"
@@ -175,7 +175,9 @@ def foretold(found: Model, setting: Setting, pilot: Mapping[str, Any]) -> dict[s
 
 
 def note(build: Build) -> str:
-    """Write into run.json what a finished run reached, and say it in a line; empty when there is nothing to say.
+    """Write into run.json what a finished run reached, and say it in a line, a warning of what was missed in another.
+
+    Empty when there is nothing to say.
 
     ``error`` is the model's, with what this run's own records say: noise of its samples, uncertainties of its stages.
     ``against_truth`` is what `insitu evaluate` found, where there is truth.
@@ -198,11 +200,25 @@ def note(build: Build) -> str:
         "stages": costs,
         "against_truth": truth and {"error": max(truth.values()), **truth},
     }
-    write(build.out / RUN, told | {"reached": reached})
+    over = missed(told["asked"], reached)
+    write(build.out / RUN, told | {"reached": reached, "warnings": over})
     seconds = f"{reached['cpu_seconds']:.0f} CPU s (predicted {told['predicted']['cpu_seconds']:.0f})"
     against = f", {max(truth.values()):.4f} against truth" if truth else ""
     predicted = f"(predicted {told['predicted']['error']:.4f})"
-    return f"reached: error {reached['error']:.4f} by its own records {predicted}{against}; {seconds}"
+    line = f"reached: error {reached['error']:.4f} by its own records {predicted}{against}; {seconds}"
+    return "\n".join([line, *(f"warning: {text}" for text in over)])
+
+
+def missed(asked: Mapping[str, float], reached: Mapping[str, Any]) -> list[str]:
+    """What a finished run did not keep of what was asked, a sentence each: by its own records, not by truth."""
+    error, seconds, found = reached["error"], reached["with_pilot_cpu_seconds"], []
+    if error > asked.get("max_error", math.inf):
+        found.append(
+            f"--max-error: was {asked['max_error']:g}; the run's own records say {error:.4f}; ask less than was asked"
+        )
+    if seconds > asked.get("time_budget", math.inf):
+        found.append(f"--time-budget: was {asked['time_budget']:g} CPU seconds; {seconds:.0f} were taken")
+    return found
 
 
 def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -213,14 +229,15 @@ def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, An
     expected = last["noise"] * math.sqrt(last["samples"] / samples)
     ratio = numbers["object_noise_rel"] / expected if expected and numbers.get("object_noise_rel") else 1.0
     anew = stated(build)
+    surer = flux_sigma(build) / pilot["flux_sigma"] if pilot["flux_sigma"] else 1.0
     found = {}
     for figure in (name for name in FIGURES if name in predicted):
         old = predicted[figure]
         parts = {
             "sampling": old["sampling"] * ratio,
             "map": old["map"],
-            "lamp": anew[figure].get(model.LAMP, 0.0),
-            "stated": model.without_lamp(anew[figure]),
+            "lamp": old["lamp"] * surer,
+            "stated": math.hypot(0.0, *anew[figure].values()),
         }
         found[figure] = parts | {"all": math.hypot(*parts.values())}
     return found

@@ -5,7 +5,8 @@ and thrown light make; each the median over its pixels. The one number is the la
 
 sampling    noise over the samples n, from differences of pilot renders of other samples and seeds; beyond them n^-1/2
 map         c / w over the probe's width w, from two pilot renders under the map and under it at half its width
-lamp        the strongest lamp's stated uncertainty, likewise: 1.6, 0.7, 0.4 % at 256, 512, 1024 px on the bundled desk
+lamp        what the stated sigmas of the lamps' flux do to a pixel, by a pilot render without each; the same for all
+            settings, as how a photograph samples a lamp is not the map's doing (desk: 6.6, 6.5, 6.6 % at 512 to 2048)
 stated      the other standard uncertainties of the stages before (exposures, ball, light, plate), for all settings
 
 Of what is no more than bounded (near field, what a photograph cannot show) nothing is in it. Costs are CPU seconds of
@@ -38,7 +39,6 @@ BY_SAMPLES = 0.5  # of a pilot render of few samples: what grows with them; meas
 FEWER_TRACED = 0.25  # the traced share falls with a picture's side to this power: desk at 256, 512, 1024 px
 RATE = 0.5  # noise falls with the samples to this power: variances of independent samples add
 LEAST = 1e-9  # difference of two pictures, so that logarithms exist
-LAMP = "strongest lamp"  # of what is stated, the part that falls with the map's texels
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Model:
     sampling: dict[str, Noise]  # figure -> noise over samples
     width: int  # of the pilot's map
     map_error: dict[str, float]  # figure -> error at that width
-    lamp: dict[str, float]  # figure -> standard uncertainty at that width
+    lamp: dict[str, float]  # figure -> standard uncertainty by the flux of lamps
     stated: dict[str, float]  # figure -> standard uncertainty
     stages: dict[str, float]  # CPU seconds of the pilot's stages
     work: Law  # pixel samples of a whole render
@@ -142,7 +142,7 @@ class Model:
             parts = {
                 "sampling": noise.at(setting.samples),
                 "map": self.map_error.get(figure, 0.0) * self.width / setting.width,
-                "lamp": self.lamp.get(figure, 0.0) * self.width / setting.width,
+                "lamp": self.lamp.get(figure, 0.0),
                 "stated": self.stated.get(figure, 0.0),
             }
             found[figure] = parts | {"all": math.hypot(*parts.values())}
@@ -190,8 +190,8 @@ def fitted(pilot: Mapping[str, Any]) -> Model:
         sampling=sampling,
         width=pilot["width"],
         map_error={figure: value for figure, value in pilot["map"].items() if value is not None},
-        lamp={figure: parts.get(LAMP, 0.0) for figure, parts in stated.items()},
-        stated={figure: without_lamp(parts) for figure, parts in stated.items()},
+        lamp={figure: value for figure, value in pilot["lamps"].items() if value is not None},
+        stated={figure: math.hypot(0.0, *parts.values()) for figure, parts in stated.items()},
         stages=pilot["stages"],
         work=growth_of(works),
         render=price_of([(run["work"], run["cpu_seconds"]) for run in pilot["renders"][1:]], pilot["scale"]),
@@ -203,11 +203,6 @@ def pair_of(text: str) -> tuple[int, int]:
     """(2, 8) of "2-8"."""
     few, many = text.split("-")
     return int(few), int(many)
-
-
-def without_lamp(stated: Mapping[str, float]) -> float:
-    """Standard uncertainties together, but for the lamp's."""
-    return math.hypot(0.0, *(value for name, value in stated.items() if name != LAMP))
 
 
 def price_of(renders: Sequence[tuple[float, float]], scale: int) -> tuple[float, float]:

@@ -3,13 +3,15 @@
 The renders see the plate through a camera of fewer pixels. Two of few samples tell how fast sampling converges (the
 noise that the denoiser leaves, which no formula gives); a third, of more, is made only when the first two do not reach
 what is asked. One under a map of half the width, repeated to the same texels so that its paths stay the same, tells
-what the map's width is worth.
+what the map's width is worth. One without each lamp that may matter tells what an error of its flux does to a pixel: in
+its shadow little, as the plate holds the sum of all light, which is not in doubt.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,15 @@ import numpy as np
 from pipeline.image import metrics
 from pipeline.run.artifacts import CAMERA, EMITTERS, HARMONICS, PHOTOGRAPHS
 from pipeline.run.runner import Build
-from pipeline.trade.model import LAMP, Setting
-from pipeline.types import Camera, Occluder, Raster
+from pipeline.trade.model import Setting
+from pipeline.types import Camera, Emitter, Occluder, Raster
 
 LONGEST_PX = 512  # of the pilot's pictures
 FEW, MORE = (2, 8), 32  # samples
 MAP_SAMPLES = FEW[-1]  # of the pair under two maps
 SEED = 1_000  # far from the run's, so that its picture's noise is not the pilot's
+LAMPS = 3  # at most, of which each costs a render
+WEAK = 0.1  # of the largest sigma of flux: a lamp below it is left out, 0.5 % of the variance
 LEAST_PX = 50  # pixels of which a median is taken; fewer are no figure
 SHADOW, GROW = metrics.SHADOW, metrics.GROW
 BOXED = metrics.BOX  # pixels along a box, over which noise that is independent averages
@@ -75,18 +79,87 @@ def differences(layers: Raster, other: Raster) -> dict[str, float | None]:
     ``object``: median relative difference where an object covers the pixel; ``shadow``: of the change's 5x5 means where
     that is over 5 %. None for fewer than `LEAST_PX` pixels.
     """
-    from scipy.ndimage import binary_dilation, binary_erosion
-
-    alpha = other["obj.A"]
-    inside = binary_erosion((alpha > 0.99) & (layers["obj.A"] > 0.99), np.ones((3, 3)), border_value=1)
+    inside, shown = figures_of(layers, other)
     by_pixel = metrics.relative(layers.rgb("obj") - other.rgb("obj"), other.rgb("obj"))
-    ours, theirs = (metrics.box(part.rgb("lost") + part.rgb("gained")) for part in (layers, other))
-    shown = metrics.relative(theirs, metrics.box(other.rgb("without"))) > SHADOW
-    shown &= ~binary_dilation(alpha > 0, np.ones((GROW, GROW))) & np.isfinite(theirs).all(-1)
+    ours, theirs = changed(layers), changed(other)
     return {
         "object": _median(by_pixel[inside]),
         "shadow": _median(metrics.relative(ours - theirs, theirs)[shown]),
     }
+
+
+def figures_of(layers: Raster, other: Raster) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (H, W) inside an object, and of shadows, as `insitu evaluate` has them; others are the truth."""
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    alpha, change = other["obj.A"], changed(other)
+    inside = binary_erosion((alpha > 0.99) & (layers["obj.A"] > 0.99), np.ones((3, 3)), border_value=1)
+    shown = metrics.relative(change, metrics.box(other.rgb("without"))) > SHADOW
+    shown &= ~binary_dilation(alpha > 0, np.ones((GROW, GROW))) & np.isfinite(change).all(-1)
+    return inside, shown
+
+
+def changed(layers: Raster) -> np.ndarray:
+    """5x5 means (H, W, 3) of the change that shadows and thrown light make."""
+    return metrics.box(layers.rgb("lost") + layers.rgb("gained"))
+
+
+def by_lamps(layers: Raster, dark: Sequence[tuple[np.ndarray, Raster]]) -> dict[str, float | None]:
+    """What relative sigmas (3,) of the flux of lamps do to both figures; ``dark``: each with layers without that lamp.
+
+    All light adds up, so an object's pixel follows a lamp by its share in it. A shadow's change is laid on the plate as
+    a ratio to the light there, P c / B: it follows by ``c' / c - B' / B``, parts of the lamp in change c and light B.
+    Lamps err independently: root of the sum of squares at each pixel, of which the median is taken.
+    """
+    names = ("object", "shadow")
+    if not dark:
+        return dict.fromkeys(names, 0.0)
+    squares = {name: np.zeros((*layers.shape, 3)) for name in names}
+    whole = {"obj": layers.rgb("obj"), "change": changed(layers), "without": metrics.box(layers.rgb("without"))}
+    for sigma, without in dark:
+        less = {"obj": without.rgb("obj"), "change": changed(without), "without": metrics.box(without.rgb("without"))}
+        part = {name: whole[name] - less[name] for name in whole}  # the lamp's
+        lit = whole["without"] > 0
+        light = np.divide(part["without"], whole["without"], out=np.zeros(lit.shape), where=lit)
+        squares["object"] += (sigma * part["obj"]) ** 2
+        squares["shadow"] += (sigma * (part["change"] - light * whole["change"])) ** 2
+    inside, shown = figures_of(layers, layers)
+    off = {name: np.sqrt(values) for name, values in squares.items()}
+    return {
+        "object": _median(metrics.relative(off["object"], whole["obj"])[inside]),
+        "shadow": _median(metrics.relative(off["shadow"], whole["change"])[shown]),
+    }
+
+
+def unsure(emitters: list[Emitter]) -> list[int]:
+    """Which emitters are rendered without: those whose sigma of flux is largest, at most `LAMPS`."""
+    sizes = [float(np.linalg.norm(np.where(np.isfinite(e.irradiance_sigma), e.irradiance_sigma, 0))) for e in emitters]
+    order = sorted(range(len(sizes)), key=lambda index: -sizes[index])
+    return [index for index in order if sizes[index] > WEAK * sizes[order[0]]][:LAMPS]
+
+
+def sigma_of(emitter: Emitter) -> np.ndarray:
+    """(3,) relative sigma of a lamp's flux; of channels without a finite one, or without light, zero."""
+    sigma, value = np.asarray(emitter.irradiance_sigma, float), np.asarray(emitter.irradiance, float)
+    known = np.isfinite(sigma) & (value > 0)
+    return np.divide(sigma, value, out=np.zeros(3), where=known)
+
+
+def flux_sigma(build: Build) -> float:
+    """Relative sigma of the flux of the lamp that is least sure, as a build states it; 0 without lamps."""
+    emitters = build.value(EMITTERS)
+    return share_of(emitters[0].irradiance_sigma, emitters[0].irradiance) if emitters else 0.0
+
+
+def without_lamp(environment: Raster, emitter: Emitter) -> Raster:
+    """The map with the texels of an emitter black."""
+    inside = np.zeros(environment.shape, bool)
+    inside.ravel()[np.asarray(emitter.texels, int)] = True
+    channels = {
+        name: np.where(inside, np.float32(0), values) if name in "RGB" else values
+        for name, values in environment.channels.items()
+    }
+    return Raster(channels, environment.space, environment.attributes)
 
 
 def _median(values: np.ndarray) -> float | None:
@@ -97,8 +170,8 @@ class Pilot:
     """Small renders of a build whose stages before the render are run, and the record of them.
 
     ``build``: settings at the pilot's width. ``record`` is JSON: width of the map, scale (pixels of the plate along a
-    side of one of the pilot's), megapixels, stages [CPU s], renders, differences, map, stated, bounds, wall over CPU
-    seconds, and the CPU seconds that all of it took, the stages' included.
+    side of one of the pilot's), megapixels, stages [CPU s], renders, differences, map, lamps, flux_sigma, stated,
+    bounds, wall over CPU seconds, and the CPU seconds that all of it took, the stages' included.
     """
 
     def __init__(self, build: Build, record: dict[str, Any] | None = None) -> None:
@@ -121,6 +194,8 @@ class Pilot:
             "renders": [self._measured(samples) for samples in FEW],
             "differences": {"-".join(map(str, FEW)): differences(*(self.layers[samples] for samples in FEW))},
             "map": differences(self._under_coarse_map(), self.layers[MAP_SAMPLES]),
+            "lamps": self._by_lamps(),
+            "flux_sigma": flux_sigma(self.build),
             "stated": stated(self.build),
             "bounds": bounds(records),
         }
@@ -176,14 +251,22 @@ class Pilot:
     def _under_coarse_map(self) -> Raster:
         """Layers of `MAP_SAMPLES` under the map at half its width. Compiled already: its CPU is that render's price."""
         cpu = time.process_time()
-        layers, _ = self._render(MAP_SAMPLES, coarse=True)
+        layers, _ = self._render(MAP_SAMPLES, {"environment": coarser(self.inputs["environment"])})
         self.warm_seconds = time.process_time() - cpu
         return layers
 
-    def _render(self, samples: int, coarse: bool = False) -> tuple[Raster, dict[str, Any]]:
-        """Layers of the small picture, and the stage's numbers."""
-        build, environment = self.build, self.inputs["environment"]
-        inputs = self.inputs | {"environment": coarser(environment) if coarse else environment}
+    def _by_lamps(self) -> dict[str, float | None]:
+        """What the stated sigmas of the lamps' flux do to both figures, by layers of `MAP_SAMPLES` without each."""
+        lamps, environment, dark = self.inputs["emitters"], self.inputs["environment"], []
+        for index in unsure(lamps):
+            others = [lamp for other, lamp in enumerate(lamps) if other != index]
+            instead = {"environment": without_lamp(environment, lamps[index]), "emitters": others}
+            dark.append((sigma_of(lamps[index]), self._render(MAP_SAMPLES, instead)[0]))
+        return by_lamps(self.layers[MAP_SAMPLES], dark)
+
+    def _render(self, samples: int, instead: Mapping[str, Any] | None = None) -> tuple[Raster, dict[str, Any]]:
+        """Layers of the small picture, and the stage's numbers; some inputs ``instead`` of the capture's."""
+        build, inputs = self.build, self.inputs | dict(instead or {})
         changes = Setting(samples, 0).changes
         knobs = {knob.removeprefix("render."): value for knob, value in changes.items() if knob.startswith("render.")}
         params = build.settings.params["render"] | knobs | {"seed": SEED + samples}
@@ -198,13 +281,13 @@ def _is_mesh(item: Occluder) -> bool:
 def stated(build: Build) -> dict[str, dict[str, float]]:
     """Figure -> {source: relative standard uncertainty}, from what the stages before the render say.
 
-    A scale of the light moves the objects and leaves shadows, which are ratios; these follow the
-    strongest lamp's share. Noise and interpolation of the plate reach a shadow over a box of pixels.
+    A scale of the light moves the objects and leaves shadows, which are ratios. Noise and interpolation of the plate
+    reach a shadow over a box of pixels.
     """
     merge, develop, probe = (
         (build.record(name) or {"numbers": {}})["numbers"] for name in ("merge", "develop", "probe")
     )
-    harmonics, emitters = build.value(HARMONICS), build.value(EMITTERS)
+    harmonics = build.value(HARMONICS)
     light = share_of(harmonics.sigma[0], harmonics.coefficients[0])
     interpolated = (develop.get("interpolation") or {}).get("median_rel") or 0.0
     return {
@@ -215,7 +298,6 @@ def stated(build: Build) -> dict[str, dict[str, float]]:
         },
         "shadow": {
             "light": light,
-            LAMP: share_of(emitters[0].irradiance_sigma, emitters[0].irradiance) if emitters else 0.0,
             "plate's noise": noise_of(build.value(PHOTOGRAPHS)["plate"]) / BOXED,
             "plate's interpolation": float(interpolated) / BOXED,
         },

@@ -145,7 +145,8 @@ class Bench:
     def _run(self, point: Point, work: Path) -> tuple[int, str]:
         """Exit code of ``insitu run`` for a point, and the last thing that it said of an error."""
         asked = self.settle(point)
-        words = [sys.executable, "-m", "stages", "run", asked.capture, "--out", str(work), "--upto", LAST]
+        folder = str(work.resolve())  # the process has another working folder
+        words = [sys.executable, "-m", "stages", "run", asked.capture, "--out", folder, "--upto", LAST]
         words += ["--quality", point.quality, *(["--scene", asked.scene] if asked.scene else [])]
         for stage in self.graph.upto(LAST):
             for knob, value in asked.params[stage.name].items():
