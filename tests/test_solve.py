@@ -389,3 +389,8 @@ def test_the_benchmark_says_whether_what_is_asked_holds():
     assert "1.20 at most" in words
     assert "within 9%" in words
     assert "2 distinct settings, the dearest 6.0 times" in words
+    refused_ = {"asked": {"max_error": 0.005}, "refused": 0.015, "final": 0.012}
+    assert "| max error 0.005 | refused | | 0.0150 | | final: 0.0120 |" in benchmark.line_of(refused_)
+    assert words in " ".join(benchmark.verdict([*runs, refused_]).split())
+    assert "which final misses too (0.0120 against truth)" in " ".join(benchmark.verdict([*runs, refused_]).split())
+    assert "wrongly" in benchmark.verdict([*runs, refused_ | {"final": 0.004}])
