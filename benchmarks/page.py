@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.scenes import SCENES
 
 LOOK = {  # strategy: label, colour, marker, line
@@ -109,26 +111,36 @@ def bias(record: dict[str, Any]) -> list[str]:
     found = record.get("zscore")
     if not found:
         return ["Largest z of a tile's mean against the reference strategy: " + number(record["zscore_max"]) + "."]
-    light = found["light_traced"]
+    light, codes = found["light_traced"], {row["code"] for row in found["scenes"]}
     lines = [
         "",
         f"`python -m benchmarks.zscore` ({found['cpu_s']:.0f} CPU s): the fast strategy against two full path-traced "
         f"renders on {found['number_of_scenes']} random scenes, tiles of 8 x 8 pixels, three channels of change and "
         f"three of objects. Largest z {found['zscore_max']:.2f} (limit 5), mean square "
-        f"{found['zscore_square_mean']:.2f} of {found['tile_channels_tested']}; "
+        f"{found['zscore_square_mean']:.2f} +- {square_sigma(found['scenes']):.2f}, by the scatter of scenes, of "
+        f"{found['tile_channels_tested']} (expected: 1); "
         f"{found['tile_channels_changed']} of the change are over 1 % of LS_noobj, and in "
         f"{found['oracle_reached_changed']:.0%} of these the oracle's standard error is at most 1 % of the change "
         f"(largest {found['oracle_rel_error_max']:.1%}). A bias of {found['smallest_detectable_bias_rel']:.1%} "
         f"of the change would be seen in the median tile, of {found['smallest_detectable_bias_rel_p90']:.1%} in nine "
         f"of ten, and of {found['smallest_detectable_common_bias_rel']:.2%} if all share it; found: "
-        f"{found['common_bias_rel']:+.2%}.",
+        f"{found['common_bias_rel']:+.2%}. Measured with the code of digest {', '.join(sorted(codes))}.",
     ]
     if light:
+        traced = [row["light_traced"] for row in found["scenes"] if "light_traced" in row]
         lines.append(
             f"With light tracing, on the {light['number_of_scenes']} scenes with a compact light: largest z "
-            f"{light['zscore_max']:.2f}, mean square {light['zscore_square_mean']:.2f}."
+            f"{light['zscore_max']:.2f}, mean square {light['zscore_square_mean']:.2f} +- {square_sigma(traced):.2f}."
         )
     return lines
+
+
+def square_sigma(scenes: list[dict[str, Any]]) -> float:
+    """Standard error of the mean z^2 of all tiles, by the scatter of scenes: tiles of one scene share its light."""
+    weight = np.array([row["tested"] for row in scenes], float)
+    value = np.array([row["zscore_square_mean"] for row in scenes])
+    off = weight * (value - weight @ value / weight.sum())
+    return float(np.sqrt((off**2).sum() * len(scenes) / max(len(scenes) - 1, 1)) / weight.sum())
 
 
 def write_page(record: dict[str, Any], folder: Path) -> None:

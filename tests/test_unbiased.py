@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks import zscore
 from benchmarks.deliberate import Told, figures
+from benchmarks.page import square_sigma
 from benchmarks.random_scenes import random_case
 from benchmarks.zscore import LIMIT, Tally, judged, line, share_out, summary, tallied, tile_pixels, total, z_of
 
@@ -91,6 +94,27 @@ def test_scenes_are_summed_up():
     assert found["oracle_reached_changed"] == pytest.approx(reached)
     assert found["smallest_detectable_common_bias_rel"] < LIMIT * min(row["bias_sigma_rel"] for row in rows)
     assert "made up" in line(0, rows[0])
+
+
+def test_kept_scenes_are_those_of_the_code_that_judges_them(monkeypatch):
+    """Its own file decides on replicates and on z: scenes that it measured before an edit are measured again."""
+    read, bytes_of = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or bytes_of(path))
+    zscore.code_digest.__wrapped__()
+    assert {"zscore.py", "random_scenes.py", "trace.py"} <= set(read)
+
+
+def test_the_scatter_of_scenes_is_the_error_of_their_mean():
+    """4000 times 20 scenes of 2 to 40 tiles whose z share a scale: the mean's scatter, to 3 % by chance."""
+    random = np.random.default_rng(2)
+    counts = np.tile([2, 10, 20, 40], 5)
+    means = (random.chisquare(4, (4000, 20)) / 4) * random.chisquare(counts, (4000, 20)) / counts
+    said = [
+        square_sigma([{"tested": n, "zscore_square_mean": m} for n, m in zip(counts, row, strict=True)])
+        for row in means
+    ]
+    scatter = (means @ counts / counts.sum()).std()
+    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(scatter, rel=0.1)  # 5 % less: unequal weights
 
 
 def test_same_constants_agree_and_other_constants_never_do():
