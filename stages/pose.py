@@ -98,9 +98,12 @@ def compute(
             if any(orders[name]["explicit"] for name in asked):
                 raise
             without = reconstruction.model_copy(update={"orients": []})
-            whole = compute(facts, photographs, camera, view_cameras, without, view_photos, params)
-            said = f"pose: further views cannot orient {', '.join(asked)} ({error}); boards and markers alone did"
-            return replace(whole, warnings=[said, *whole.warnings])
+            said = f"pose: further views cannot orient {', '.join(asked)} ({error})"
+            try:
+                whole = compute(facts, photographs, camera, view_cameras, without, view_photos, params)
+            except (CaptureError, NumericalError) as alone:
+                raise type(alone)(f"{said}, nor can boards and markers alone: {alone}") from error
+            return replace(whole, warnings=[f"{said}; boards and markers alone did", *whole.warnings])
         views, extra, cloud = views | found[0], found[1], found[2]
     places: dict[str, Any] = {}
     if mapped:

@@ -17,7 +17,7 @@ from pipeline.camera.rigid import camera_points
 from pipeline.camera.sources import KnownLens, left_at
 from pipeline.run import artifacts as A
 from pipeline.run import formats
-from pipeline.run.errors import ManifestError
+from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.types import Bracket, Camera, Frame, Raster, Reconstruction, Sources, View
 from stages import calibrate, knobs, pose, sfm, sources
 
@@ -169,6 +169,20 @@ def test_a_cloud_that_no_marker_places_leaves_the_pose_to_the_plates_marker(plat
     result = pose.compute(FACTS, {"plate": raster(picture)}, TRUTH, {}, cloud, [], knobs.Pose())
     assert result.outputs["views"]["plate"].route == "marker"
     assert result.warnings[0].startswith("pose: further views cannot orient plate (sfm: the first marker is seen in 1")
+
+
+def test_neither_cloud_nor_marker_is_said_with_both_reasons() -> None:
+    """The plate shows no mark, so the marker route ends too: what ended the cloud is said before it."""
+    cloud = Reconstruction(
+        names=["plate"], world_from_camera=looking_at(np.zeros(3), 30, 0, 0.4)[None], cameras=[TRUTH], camera_of=[0],
+        orients=["plate"],
+    )  # fmt: skip
+    with pytest.raises(CaptureError) as error:
+        pose.compute(FACTS, {"plate": raster(np.full((360, 480), 0.3))}, TRUTH, {}, cloud, [], knobs.Pose())
+    said = str(error.value)
+    assert said.startswith("pose: further views cannot orient plate (sfm: the first marker is seen in none of the 1")
+    assert ", nor can boards and markers alone: plate: 0 corners of the marker found" in said
+    assert "\n" not in said
 
 
 SEEN = """
