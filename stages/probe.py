@@ -126,7 +126,8 @@ def completed(
     if gloss is None:
         rgb = filled
     else:
-        rgb = known[..., None] * rgb + (1 - known[..., None]) * (np.maximum(filled, 0) + offset)
+        # What was seen in part is mixed with its surroundings in `filled` already.
+        rgb = np.where(known[..., None] > 0, filled, np.maximum(filled, 0)) + offset
         variance = variance + ground_gloss.mirrored_variance(gloss, known)
     return Whole(clipped.recover(rgb, variance, over, witness), known, gap)
 

@@ -14,6 +14,7 @@ from pipeline.light.environment import AXES, irradiance
 from pipeline.probes import combine, ground_gloss
 from pipeline.probes.observation import lookup_channels
 from pipeline.probes.witness import Witness
+from pipeline.types import Surface
 from stages.probe import completed
 
 LAMP = lamp_and_sky(400.0, (0.05, 0.62, -0.75))  # its mirror image lies in the middle of the plate
@@ -127,3 +128,16 @@ def test_filled_directions_show_the_mirror_image():
     assert (dull.lamps.rgb[gap].sum(0) < 0.7 * light).all()
     z = np.abs(shown.lamps.rgb - truth)[gap] / np.sqrt(shown.lamps.variance[gap])
     assert np.mean(z < 2) > 0.8
+
+
+def test_a_lobe_that_mirrors_nothing_fills_to_the_same_bits():
+    """Half seen texels of thrice the light and a hole: mixed with what is around once, whether the ground has gloss."""
+    rgb, seen, nothing = np.ones((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH))
+    rgb[40:50, 30:60], seen[40:50, 30:60] = 3.0, 0.125  # of which four times as much counts as known
+    seen[42:46, 80:90] = 0
+    merged = combine.Merged(rgb, np.full(rgb.shape, 1e-6), seen, np.ones(seen.shape), np.ones((1, *seen.shape)))
+    below = combine.Below(np.zeros(rgb.shape), np.zeros(rgb.shape), nothing)
+    gloss = ground_gloss.Gloss(Surface(model="rough", roughness=0.3), np.zeros(rgb.shape), below)
+    with_lobe, without = (completed(merged, np.zeros(3), below, nothing, Witness(), one) for one in (gloss, None))
+    assert np.array_equal(with_lobe.lamps.rgb, without.lamps.rgb)
+    assert np.array_equal(with_lobe.lamps.variance, without.lamps.variance)
