@@ -23,8 +23,8 @@ ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline
 # Relative error of a lamp's light (R, G, B) times the pixels that it covers, each colour sampled by a mosaic by itself.
 # Errors over the sigma that it gives, rms: 0.6 to 0.7 for lamps of 2 to 4 degrees, 10 to 80 pixels, in balls of 60 and
 # 120 px by Malvar; 0.55 to 0.75 by bilinear demosaicking from 20 pixels on, 1.3 at ten; 1.05 for the desk's three lamps
-# in one view, of which one colour is off by 2.4 (tests/test_alike.py, tests/test_flux_whole.py): small lamps err by more
-# than in proportion, so the smallest rule.
+# in one view, of which one colour is off by 2.4 (tests/test_alike.py, tests/test_flux_whole.py). Small lamps err by
+# more than in proportion: the rule is theirs.
 SAMPLED = np.array([2.0, 1.0, 2.0])
 
 
