@@ -131,18 +131,31 @@ def test_what_a_lamps_flux_does_to_objects_and_shadows_is_that_of_a_plate_that_i
     assert pilot.by_lamps(whole, []) == {"object": 0, "shadow": 0}
 
 
-def test_lamps_that_are_surest_of_all_are_not_rendered_without():
-    def lamp(sigma: float) -> Emitter:
-        about = {"direction": np.array([0.0, 1.0, 0.0]), "solid_angle_sr": 0.01, "half_angle_rad": 0.05}
-        texels = np.array([70, 71, 200])
-        return Emitter(name="lamp", irradiance=np.ones(3), irradiance_sigma=np.full(3, sigma), texels=texels, **about)
+def test_a_lamp_that_is_all_the_light_needs_no_render_without_it():
+    lamp, light = lamp_of(0.1), staged.artifacts()["environment"]
+    only = {name: np.zeros_like(light[name]) for name in "RGB"}
+    for values in only.values():
+        values.ravel()[lamp.texels] = 5.0
+    one = pilot.Pilot(None)  # type: ignore[arg-type]
+    one.layers[pilot.MAP_SAMPLES] = lit_by([6.0], [1.0])
+    one.inputs = {"emitters": [lamp], "environment": Raster(only, "acescg")}
+    assert one._by_lamps() == {"object": pytest.approx(0.1), "shadow": pytest.approx(0, abs=1e-9)}
 
-    assert pilot.unsure([lamp(s) for s in (0.1, 0.3, 0.01, 0.2, 0.29)]) == [1, 4, 3]
+
+def lamp_of(sigma: float) -> Emitter:
+    """A lamp of three texels with a relative sigma of its flux."""
+    about = {"direction": np.array([0.0, 1.0, 0.0]), "solid_angle_sr": 0.01, "half_angle_rad": 0.05}
+    texels = np.array([70, 71, 200])
+    return Emitter(name="lamp", irradiance=np.ones(3), irradiance_sigma=np.full(3, sigma), texels=texels, **about)
+
+
+def test_lamps_that_are_surest_of_all_are_not_rendered_without():
+    assert pilot.unsure([lamp_of(s) for s in (0.1, 0.3, 0.01, 0.2, 0.29)]) == [1, 4, 3]
     assert pilot.unsure([]) == []
-    assert pilot.sigma_of(lamp(0.1)) == pytest.approx(0.1)
-    assert pilot.sigma_of(lamp(math.inf)) == pytest.approx(0)
+    assert pilot.sigma_of(lamp_of(0.1)) == pytest.approx(0.1)
+    assert pilot.sigma_of(lamp_of(math.inf)) == pytest.approx(0)
     light = staged.artifacts()["environment"]
-    black = pilot.without_lamp(light, lamp(0.1)).rgb().reshape(-1, 3)
+    black = pilot.without_lamp(light, lamp_of(0.1)).rgb().reshape(-1, 3)
     assert not black[[70, 71, 200]].any()
     others = np.setdiff1d(np.arange(len(black)), [70, 71, 200])
     assert (black[others] == light.rgb().reshape(-1, 3)[others]).all()

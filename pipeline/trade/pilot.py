@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.image import metrics
+from pipeline.light.environment import total_energy
 from pipeline.run.artifacts import CAMERA, EMITTERS, HARMONICS, PHOTOGRAPHS
 from pipeline.run.runner import Build
 from pipeline.trade.model import Setting
@@ -28,6 +29,7 @@ MAP_SAMPLES = FEW[-1]  # of the pair under two maps
 SEED = 1_000  # far from the run's, so that its picture's noise is not the pilot's
 LAMPS = 3  # at most, of which each costs a render
 WEAK = 0.1  # of the largest sigma of flux: a lamp below it is left out, 0.5 % of the variance
+UNLIT = 1e-3  # of the light's energy: what a lamp leaves below it is black, and shows a renderer nothing
 LEAST_PX = 50  # pixels of which a median is taken; fewer are no figure
 SHADOW, GROW = metrics.SHADOW, metrics.GROW
 BOXED = metrics.BOX  # pixels along a box, over which noise that is independent averages
@@ -257,12 +259,17 @@ class Pilot:
 
     def _by_lamps(self) -> dict[str, float | None]:
         """What the stated sigmas of the lamps' flux do to both figures, by layers of `MAP_SAMPLES` without each."""
-        lamps, environment, dark = self.inputs["emitters"], self.inputs["environment"], []
+        lamps, environment, layers, dark = self.inputs["emitters"], self.inputs["environment"], self.layers, []
         for index in unsure(lamps):
             others = [lamp for other, lamp in enumerate(lamps) if other != index]
-            instead = {"environment": without_lamp(environment, lamps[index]), "emitters": others}
-            dark.append((sigma_of(lamps[index]), self._render(MAP_SAMPLES, instead)[0]))
-        return by_lamps(self.layers[MAP_SAMPLES], dark)
+            rest = without_lamp(environment, lamps[index])
+            if total_energy(rest.rgb()).sum() <= UNLIT * total_energy(environment.rgb()).sum():
+                black = {name: np.zeros_like(values) for name, values in layers[MAP_SAMPLES].channels.items()}
+                without = Raster(black, layers[MAP_SAMPLES].space)
+            else:
+                without, _ = self._render(MAP_SAMPLES, {"environment": rest, "emitters": others})
+            dark.append((sigma_of(lamps[index]), without))
+        return by_lamps(layers[MAP_SAMPLES], dark)
 
     def _render(self, samples: int, instead: Mapping[str, Any] | None = None) -> tuple[Raster, dict[str, Any]]:
         """Layers of the small picture, and the stage's numbers; some inputs ``instead`` of the capture's."""
