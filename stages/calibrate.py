@@ -64,7 +64,7 @@ def compute(
             numbers |= {"source": camera.source, "focal_sigma_rel": relative, "rms_px": camera.rms_px,
                         "principal_point_sigma_px": sigma[2:4].tolist()}  # fmt: skip
             del numbers["corner_sigma_rel"]
-            warnings = few_boards(relative)
+            warnings, evidence = few_boards(relative), rows_by_boards(camera, evidence)
         whole = Result({"camera": camera}, numbers, warnings, evidence)
     cameras: dict[str, Camera] = {}
     done: list[tuple[dict[str, Any], Camera]] = []
@@ -93,6 +93,24 @@ def few_boards(relative: float) -> list[str]:
         f"calibrate: focal length by EXIF and the board in the capture's own views, known to {relative:.1%} only, and "
         "what is placed scales with it; photograph a board for [camera] calibration"
     ]
+
+
+def rows_by_boards(camera: Camera, by_word: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """EXIF's rows of focal length and distortion, as boards in the capture's own views have them: ``camera``'s."""
+    sigma = np.sqrt(np.diag(camera.covariance))
+    half = 0.5 * float(np.hypot(camera.width, camera.height))
+    corner_px = half * float(sigma[4]) * (half / camera.fx) ** 2  # of k1, which alone is free of the distortion
+    costs = {
+        "focal length": f"{sigma[0] / camera.fx:.2%} of distances (one sigma)",
+        "distortion": f"{corner_px:.2g} px at the corners (one sigma of k1)",
+    }
+    return [
+        row
+        if row["term"] not in costs
+        else row | {"modelled": True, "could_cost": costs[row["term"]],
+                    "because": f"{row['because']}; fitted to the boards in the capture's own views"}
+        for row in by_word
+    ]  # fmt: skip
 
 
 def frame_of(brackets: dict[str, Bracket], view: str) -> Frame | None:

@@ -101,3 +101,34 @@ def test_the_plate_is_its_own_calibration(made) -> None:
     assert row["because"].startswith("2 views show them: focal length -")
     assert decided.warnings == []
     assert decided.outputs["sources"].cloud is False
+
+
+def test_what_is_said_of_the_lens_is_what_boards_made_of_it(made) -> None:
+    """Not EXIF's word: that is 5 % of the focal length by rule, and no distortion."""
+    _, _, found = made
+    camera = found.outputs["camera"]
+    rows = {row["term"]: row for row in found.evidence}
+    sigma = np.sqrt(np.diag(camera.covariance))
+    assert rows["focal length"]["could_cost"].startswith(f"{sigma[0] / camera.fx:.2%} of distances")
+    assert camera.distortion[0] != 0
+    assert rows["distortion"]["modelled"]
+    at_corner = project_corner(camera, sigma[4]) - project_corner(camera, 0.0)
+    assert float(rows["distortion"]["could_cost"].split(" px")[0]) == pytest.approx(at_corner, rel=0.06)  # two digits
+    assert not any("by rule" in row["could_cost"] for row in rows.values())
+
+
+def project_corner(camera: Camera, more_k1: float) -> float:
+    """Distance [px] from the axis of what an undistorted lens shows in the corner, by k1 alone that is larger."""
+    half = 0.5 * float(np.hypot(camera.width, camera.height))
+    changed = camera.model_copy(update={"distortion": np.array([more_k1, 0, 0, 0, 0])})
+    return float(project(changed, np.array([[half / camera.fx, 0, 1.0]]))[0, 0] - camera.cx)
+
+
+def test_residual_is_what_corners_are_off_by() -> None:
+    """Noise of 0.1 px each way where 0.3 px is the least that a corner is taken for: 144 coordinates, 22 unknowns."""
+    words = by_words()
+    views = seen_boards(np.random.default_rng(1), words, [(40, 10), (30, 130), (35, 250)])
+    found = sharpened(words, bundle_of_boards(words, views, 0.3, 1.0), 0.3)
+    assert found is not None
+    expected = 0.1 * np.sqrt(2 * (1 - 22 / 144))
+    assert found[0].rms_px == pytest.approx(expected, rel=0.2)  # 122 squares: 6.4 %, three of these

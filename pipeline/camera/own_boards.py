@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.camera.adjustment import free_columns, lens_vector
 from pipeline.camera.bundle import Adjusted, adjust
-from pipeline.camera.reprojection import Bundle, Corners
+from pipeline.camera.reprojection import Bundle, Corners, residuals_of
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.run.errors import NumericalError
@@ -74,4 +74,5 @@ def sharpened(exif: Camera, boards: Bundle, sigma_px: float) -> tuple[Camera, fl
 
 
 def _rms(found: Adjusted) -> float:
-    return float(found.corner_sigma_px * np.sqrt(2))
+    """Root mean square distance [px] of the corners from where the adjusted boards have them."""
+    return float(np.sqrt((residuals_of(found.bundle) ** 2).sum(-1).mean()))
