@@ -153,11 +153,12 @@ def errors(radius_px: int, half_angle_deg: float, method: Method, seeds: int = 2
 def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg, method):
     """Lamps of 20 pixels. Measured over 21 lamps each: rms of error over sigma, Malvar and bilinear, 0.68 and 1.3
     (60 px, 2 degrees: 10 pixels), 0.59 and 0.71 (60, 4), 0.58 and 0.75 (120, 2), 0.65 and 0.55 (120, 4).
-    Here 14 lamps of 3 channels: the rms of 42 values is known to 11 %, twice that as lamps' channels are not alone.
+    Here 14 lamps of 3 channels: 0.51 +- 0.05 and 0.66 +- 0.13, by the scatter of lamps. Two standard errors below
+    either is 0.4: sigma larger by 1.3 and 1.6 fails.
     """
     z = errors(radius_px, half_angle_deg, method)
     assert len(z) >= 10
-    assert 0.3 < np.sqrt((z**2).mean()) < 1.1
+    assert 0.4 < np.sqrt((z**2).mean()) < 1.1
     assert (np.abs(z) < 2).mean() > 0.9
 
 
