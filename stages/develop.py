@@ -33,6 +33,8 @@ from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
 
+SURE = 5.0  # standard uncertainties: by noise alone, a negative value in 3e6
+FEW = 1e-4  # of the pixels: so many negative ones are counted in silence
 EDGE_PX = 1024  # side of the middle of the plate on which the error of interpolation is measured
 
 
@@ -69,6 +71,7 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
         evidence.append(_interpolation(shown_in, numbers["interpolation"]))
     evidence = [*losses.evidence(views, profiles, {view: mosaics[view].shape for view in views}), *evidence]
     warnings += losses.warnings
+    warnings += _negative(shown_in, photographs[shown_in], numbers["views"][shown_in]["negative_px"])
     plate = plate_profile(profiles)
     if plate["as_shot_neutral"] is None and plate["space"] == CAMERA_RGB and "fitted" not in plate:
         warnings.append(f"{plate['file']}: no AsShotNeutral; the scene's white is taken as D65")
@@ -78,6 +81,17 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
         if profile["camera"] != plate["camera"]:
             evidence.append(_other_camera(profile))
     return Result({"photographs": photographs}, numbers, warnings, evidence)
+
+
+def _negative(view: str, photograph: Raster, count: int) -> list[str]:
+    """A line when many pixels are negative beyond noise."""
+    if count <= FEW * photograph["mask"].size:
+        return []
+    least = float(photograph.rgb()[photograph["mask"] & CLIPPED == 0].min())
+    return [
+        f"{view}: {count} pixels are negative beyond noise, to {least:.3g}: edges that interpolation overshoots "
+        "(least with develop.demosaic = bilinear), or colours lie outside ACEScg; they are kept as they are"
+    ]
 
 
 def edge_error(mosaic: Raster, acescg_from_camera: np.ndarray) -> dict[str, float]:
@@ -206,7 +220,9 @@ def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str)
 def _numbers(photograph: Raster) -> dict[str, Any]:
     rgb = photograph.rgb()
     usable = photograph["mask"] & CLIPPED == 0
+    beyond_noise = np.any(rgb < -SURE * np.sqrt(photograph.rgb("variance")), -1) & usable
     return {
+        "negative_px": int(np.count_nonzero(beyond_noise)),
         "negative_fraction": float(np.mean(np.any(rgb < 0, -1))),
         "outside_rec709_fraction": float(np.mean(np.any(colour.convert(rgb, "acescg", "linear_rec709") < 0, -1))),
         "clipped_fraction": float(1 - np.mean(usable)),

@@ -67,6 +67,8 @@ def compute(capture_folder: Path, scene_file: Path | None, params: knobs.Ingest)
     flaws: list[str] = []
     warnings: list[str] = []
     scene = scene_file or next((f for f in [manifest.parent / DEFAULT_SCENE] if f.is_file()), None)
+    if scene is None:
+        warnings.append(f"{manifest.parent / DEFAULT_SCENE}: no such file: nothing is put in, the plate comes back")
     wishes = _wishes(scene, root, problems)
     board, board_frames = _board_photos(facts, root, manifest, problems, flaws)
     dumped = {**facts.model_dump(mode="json"), "capture_root": str(root), **_truth(facts, manifest, problems)}

@@ -31,7 +31,7 @@ from pipeline.transport.estimate import WORTH_TRACING, Shot, lit, prepare, sampl
 from pipeline.transport.near_one import near_one
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.pilot import Effort
-from pipeline.transport.placing import feet, place_objects
+from pipeline.transport.placing import clearances, feet, off_plane, place_objects
 from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.trace import LensRays, Rays
@@ -80,6 +80,8 @@ def compute(
             ["scene.toml: no objects; the plate comes back"],
         )
     pose = views["plate"].world_from_camera
+    standing = clearances(wishes, plane)
+    unsteady, lifted = off_plane(wishes, standing)
     moved = near_one(pose, feet(wishes, plane))
     if moved is not None:
         wishes, plane, pose = moved.wishes(wishes), moved.plane(plane), moved.pose(pose)
@@ -113,6 +115,7 @@ def compute(
         "lights": len(apart) + 1,
         "variant": use_mitsuba().variant(),
     }
+    numbers["lowest_point_mm"] = {name: 1e3 * lowest for name, (lowest, _) in standing.items()}
     if moved is not None:
         numbers["rendered_about_m"], numbers["rendered_at_scale"] = moved.origin_m.tolist(), moved.scale
     if params.light_groups:
@@ -127,7 +130,7 @@ def compute(
         result = refined(canvas)
     layers, found, said = result
     numbers |= found
-    return Result({"layers": layers}, numbers, warnings + said, evidence(params, numbers))
+    return Result({"layers": layers}, numbers, unsteady + warnings + said, evidence(params, numbers) + lifted)
 
 
 def strong(emitters: list[Emitter], plane: Plane, light: np.ndarray) -> list[Emitter]:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from command import DESK, FOCAL, GIVEN, HEIGHT, POSE, ROOT, WIDTH, command, copied, desk_with, dng, refused, tiny
 
+from pipeline.run.board_facts import DICTIONARIES
 from pipeline.run.cli import main
 from stages.order import NAMES
 
@@ -257,8 +258,40 @@ def test_board_of_another_kind_than_photographed(capsys, tmp_path):
 
 def test_unknown_dictionary(capsys, tmp_path):
     folder = desk_with(tmp_path / "d", {"DICT_5X5_100": "DICT_5X5_10"})
-    (line,) = refused(capsys, 2, "run", folder, "--upto", "calibrate", "--out", tmp_path / "out")
-    assert "DICT_5X5_10" in line
+    (line,) = refused(capsys, 2, "settings", folder, "--out", tmp_path / "out")
+    assert re.search(r"capture.toml:\d+: board.dictionary: is 'DICT_5X5_10'; did you mean DICT_5X5_100", line)
+    small = tiny(tmp_path / "t", '[[marker]]\ndictionary = "DICT_5x5_100"\nid = 3\nside_m = 0.1\n')
+    (line,) = refused(capsys, 2, "settings", small, "--out", tmp_path / "out")
+    assert line.endswith("marker[0].dictionary: is 'DICT_5x5_100'; did you mean DICT_5X5_100?")
+    cv2 = pytest.importorskip("cv2")
+    assert sorted(DICTIONARIES) == sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+
+
+def test_wishes_that_are_meant_otherwise(capsys, tmp_path):
+    objects = '[[object]]\nname = "a"\nfile = "a.ply"\nposition_m = [0.1, 0.2, 0.3]\nheight_m = 0.1\n'
+    lines = refused(capsys, 2, "settings", tiny(tmp_path, GIVEN, objects), "--out", tmp_path / "out")
+    assert sorted(line.removeprefix(f"{tmp_path}/") for line in lines) == [
+        "scene.toml:4: object[0].position_m: is [0.1, 0.2, 0.3]; expected two numbers, x and z on the plane; the "
+        "height above it is lift_m",
+        "scene.toml:5: object[0].height_m: unknown key; did you mean lift_m?",
+    ]
+    twice = 2 * '[[object]]\nname = "a"\nfile = "a.ply"\nposition_m = [0.1, 0.2]\n'
+    (line,) = refused(capsys, 2, "settings", tiny(tmp_path, GIVEN, twice), "--out", tmp_path / "out")
+    assert line == f"{tmp_path}/scene.toml: object names are ['a', 'a']; each must be unique"
+
+
+def test_a_build_folder_that_changes_hands_says_so(capsys, tmp_path):
+    for name in ("one", "two"):
+        assert main(["settings", str(tiny(tmp_path / name, GIVEN)), "--out", str(tmp_path / "out")]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    ours, theirs = ((tmp_path / name / "capture.toml").resolve() for name in ("one", "two"))
+    assert line == f"insitu: {tmp_path / 'out'}: was a build of {ours}, becomes one of {theirs}"
+
+
+def test_help_of_a_stage_lists_its_knobs(capsys):
+    with pytest.raises(SystemExit):
+        main(["render", "--help"])
+    assert re.search(r"\n  render\.samples \(\d+\): \w", capsys.readouterr().out)
 
 
 def test_no_ball_in_its_photograph(desk_build, capsys, tmp_path):

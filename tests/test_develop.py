@@ -68,6 +68,21 @@ def test_a_clipped_channel_makes_its_pixel_alone_a_lower_bound():
     assert np.isfinite(photograph.rgb()).all()
 
 
+def test_negative_pixels_beyond_noise_are_counted_and_said():
+    """Noise of 1: -4 is noise, -6 is not, and what touched a clipped photosite is not counted."""
+    values = np.full((6, 6, 3), 100, np.float32)
+    values[1, 1, 1], values[2, 2, 1], values[3, 3, 1] = -4, -6, -6
+    raster = three_channels(values, "acescg")
+    for name in "RGB":
+        raster[f"variance.{name}"][:] = 1
+    raster["mask"][3, 3] = CLIPPED
+    result = develop.compute({}, {"plate": raster}, knobs.Develop())
+    assert result.numbers["views"]["plate"]["negative_px"] == 1
+    assert "plate: 1 pixels are negative beyond noise, to -6" in "".join(result.warnings)
+    bright = three_channels(np.ones((6, 6, 3), np.float32), "acescg")
+    assert not develop.compute({}, {"plate": bright}, knobs.Develop()).warnings
+
+
 def test_a_camera_beside_developed_data_keeps_its_own_white():
     """Nothing says which white a developed plate was balanced to, so nothing is taken over from it."""
     developed = three_channels(np.ones((4, 4, 3), np.float32), "acescg", profile(camera="Two", color_matrix=None))

@@ -21,8 +21,7 @@ WIDTH = 118
 def text_of(proposal: Proposal, name: str, root: str = ".") -> str:
     """The manifest's text. ``root``: the photographs' folder as seen from the manifest."""
     known = [shot.first.frame.file for shot in proposal.shots]
-    everything = [photo.frame.file for shot in proposal.shots for photo in shot.photos]
-    everything += [*proposal.left_out, *proposal.flaws]
+    everything = everything_of(proposal)
     plates, balls = proposal.of("plate"), proposal.of("ball")
     lines = [
         *comment(
@@ -55,6 +54,12 @@ def text_of(proposal: Proposal, name: str, root: str = ".") -> str:
     lines += exposure_lines([photo for shot in [*plates, *balls] for photo in shot.photos])
     lines += left_lines(proposal, known)
     return "\n".join(lines) + "\n"
+
+
+def everything_of(proposal: Proposal) -> list[str]:
+    """Every file of the folder."""
+    taken = [photo.frame.file for shot in proposal.shots for photo in shot.photos]
+    return [*taken, *proposal.left_out, *proposal.flaws]
 
 
 def comment(text: str) -> list[str]:

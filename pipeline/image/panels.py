@@ -304,6 +304,7 @@ def plane_part(build: Build) -> dict[str, Any]:
     view = build.views["plate"].world_from_camera
     segments = fig.grid_segments(build.plane.corners_m, 10, 10, "grid", "edge")
     lines, labels = fig.world_lines(build.camera, view, segments), []
+    whole = any(fig.world_lines(build.camera, view, [segment]) for segment in segments if segment[2] == "edge")
     reach = 0.012 * np.linalg.norm(build.plane.corners_m[1] - build.plane.corners_m[0])
     for wish in build.wishes.get("object", []):
         foot = np.array([wish["position_m"][0], 0.0, wish["position_m"][1]])
@@ -313,7 +314,8 @@ def plane_part(build: Build) -> dict[str, Any]:
         px = fig.world_pixel(build.camera, view, foot)
         if np.isfinite(px).all():
             labels.append(fig.Label(float(px[0]), float(px[1]) + 0.032 * build.frame[0], wish["name"]))
-    caption = "yellow: the rectangle that is modelled, in tenths; orange: where the objects stand"
+    caption = "yellow: the rectangle that is modelled, in tenths" if whole else "lines: tenths of what is modelled"
+    caption += "; orange: where the objects stand" * bool(labels)
     figure = fig.photo(
         build.plate_picture, "Plane", caption, size=build.frame, lines=lines, labels=labels, width="half"
     )

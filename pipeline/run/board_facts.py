@@ -5,10 +5,11 @@ The ids of a printed layout's markers are its own, so a photograph tells which l
 
 from __future__ import annotations
 
+import difflib
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.run.strict import Strict
 
@@ -25,6 +26,24 @@ SMALLEST_MARKER_M = 0.0005
 FARTHEST_SCALE = 1.5  # of a print: beyond it the measured number is a slip
 
 
+DICTIONARIES = (  # of OpenCV
+    *(f"DICT_{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36H12", "DICT_ARUCO_MIP_36h12"),
+    *(f"DICT_APRILTAG_{bits}{h}{distance}" for bits, distance in ((16, 5), (25, 9), (36, 10), (36, 11)) for h in "hH"),
+)
+
+
+def _known_dictionary(name: str) -> str:
+    if name not in DICTIONARIES:
+        close = difflib.get_close_matches(name.upper(), DICTIONARIES, 1)
+        meant = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(DICTIONARIES)}"
+        raise ValueError(f"is {name!r}; {meant}")
+    return name
+
+
+Dictionary = Annotated[str, AfterValidator(_known_dictionary)]
+
+
 class BoardFacts(Strict):
     """The printed board that defines the world. A grid's square is the pitch of its markers."""
 
@@ -32,7 +51,7 @@ class BoardFacts(Strict):
         "charuco", description="grid: of ArUco markers or AprilTags, ids row by row; a chessboard has no markers"
     )
     layout: str | None = Field(None, description=f"{' or '.join(LAYOUTS)}, as insitu board prints it; says the rest")
-    dictionary: str = "DICT_5X5_100"
+    dictionary: Dictionary = "DICT_5X5_100"
     first_id: int = Field(0, ge=0, description="of its markers")
     squares: tuple[int, int] = Field(description="along x, along y")
     square_m: float = Field(gt=0.001, lt=1.0, description="beside a layout: as measured on the print")

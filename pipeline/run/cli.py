@@ -36,6 +36,23 @@ def stage_names() -> tuple[str, ...]:
     return NAMES
 
 
+class Help(argparse.Action):
+    """Help of a verb; a stage's with its knobs, which are read only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        """Print it and leave."""
+        parser.print_help()
+        if stage := parser.get_default("stage"):
+            from stages.knobs import KNOBS
+
+            fields = KNOBS[stage].model_fields
+            if fields:
+                say("\nknobs, of scene.toml or of insitu run --set:")
+            for name, field in fields.items():
+                say(f"  {stage}.{name} ({field.default}): {field.description}")
+        parser.exit()
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The command line: one verb per stage and a few that join them."""
     parser = argparse.ArgumentParser(prog="insitu", description="Put objects into a photograph.", epilog=EPILOG)
@@ -43,7 +60,8 @@ def build_parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
     def verb(name: str, text: str, capture: bool = True) -> argparse.ArgumentParser:
-        sub = verbs.add_parser(name, help=text, description=text)
+        sub = verbs.add_parser(name, help=text, description=text, add_help=False)
+        sub.add_argument("-h", "--help", action=Help, nargs=0, help="show this help and exit")
         if capture:
             either = "?" if name == "evaluate" else None  # evaluate also takes --capture, as scoring scripts write it
             sub.add_argument("capture", type=Path, nargs=either, help="capture folder, or its capture.toml")
@@ -63,6 +81,15 @@ def build_parser() -> argparse.ArgumentParser:
             sub.add_argument(f"--{knob}", help=f"{text} of the OCIO config ($OCIO, else a built-in one)")
         return sub
 
+    board = verb("board", closure.summary("stages.board"), capture=False)
+    board.add_argument("--paper", choices=["A4", "Letter"], required=True, help="A4 or Letter")
+    board.add_argument("--out", type=Path, default=Path("board.pdf"), help="the PDF (default: board.pdf)")
+    init = verb("init", closure.summary("stages.init"), capture=False)
+    init.add_argument("folder", type=Path, help="folder of photographs, searched with all folders below")
+    init.add_argument("-o", dest="out", type=Path, help="write it here (default: print it); never overwrites")
+    check = verb("check", closure.summary("stages.check"), capture=False)
+    check.add_argument("capture", type=Path, help="folder of photographs, or a capture.toml")
+    check.add_argument("--json", action="store_true", help="print the findings as JSON")
     run = asking(verb("run", "run every stage that is not up to date, in one process"))
     run.add_argument("--upto", help="last stage to run")
     asking(verb("settings", "resolve what a run is asked into settings.json"))
@@ -90,15 +117,6 @@ def build_parser() -> argparse.ArgumentParser:
     ball.add_argument("--exposures", help="seconds, as 1/20,1/60,..., where the files' metadata lack them")
     ball.add_argument("--distance-ratio", type=float, default=20.0, help="distance over radius of the ball (20)")
     ball.add_argument("--width", type=int, default=1024, help="of the map [px]; its height is half (1024)")
-    board = verb("board", closure.summary("stages.board"), capture=False)
-    board.add_argument("--paper", choices=["A4", "Letter"], required=True, help="A4 or Letter")
-    board.add_argument("--out", type=Path, default=Path("board.pdf"), help="the PDF (default: board.pdf)")
-    init = verb("init", closure.summary("stages.init"), capture=False)
-    init.add_argument("folder", type=Path, help="folder of photographs, searched with all folders below")
-    init.add_argument("-o", dest="out", type=Path, help="write it here (default: print it); never overwrites")
-    check = verb("check", closure.summary("stages.check"), capture=False)
-    check.add_argument("capture", type=Path, help="folder of photographs, or a capture.toml")
-    check.add_argument("--json", action="store_true", help="print the findings as JSON")
     verb("doctor", "say what was found on this machine, what is missing and what that costs", capture=False)
     figures = verb("figures", "print the page of figures of finished builds", capture=False)
     figures.add_argument("builds", type=Path, nargs="+", help="build folders")
@@ -323,6 +341,8 @@ def with_build(args: argparse.Namespace) -> int:
     if args.verb in ("run", "settings"):
         chosen = resolved(args)
         out = out_of(args)
+        if (out / "settings.json").exists() and (before := asked.load(out).capture) != chosen.capture:
+            say(f"insitu: {out}: was a build of {before}, becomes one of {chosen.capture}", stream=sys.stderr)
         asked.save(chosen, out)
     else:
         out = out_of(args)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from pipeline.run.board_facts import BoardFacts
+from pipeline.run.board_facts import BoardFacts, Dictionary
 from pipeline.run.camera_facts import PoseFacts
 from pipeline.run.develop_facts import ChartFacts, LensFacts
 from pipeline.run.errors import ManifestError
@@ -67,7 +67,7 @@ class BallFacts(Strict):
 class MarkerFacts(Strict):
     """An ArUco or AprilTag marker; the first one defines the world, the places of others are found."""
 
-    dictionary: str = "DICT_5X5_100"
+    dictionary: Dictionary = "DICT_5X5_100"
     id: int = Field(ge=0)
     side_m: float = Field(gt=0.001, lt=5.0)
 
@@ -278,6 +278,13 @@ class ObjectWish(Strict):
     scale: float = Field(1.0, gt=0, description="metres per unit of the file")
     material: MaterialWish | None = None
 
+    @field_validator("position_m", mode="before")
+    @classmethod
+    def _on_the_plane(cls, value: Any) -> Any:
+        if isinstance(value, list) and len(value) == 3:
+            raise ValueError(f"is {value}; expected two numbers, x and z on the plane; the height above it is lift_m")
+        return value
+
 
 class SceneWishes(Strict):
     """scene.toml, less the knobs of the stages (tables named after a stage, checked against stages/knobs.py)."""
@@ -291,6 +298,9 @@ class SceneWishes(Strict):
         if len(set(names)) < len(names):
             raise ValueError(f"object names are {names}; each must be unique")
         return self
+
+
+MEANT = {"height_m": ("lift_m",), "y_m": ("lift_m",), "rotation_deg": ("yaw_deg",), "size": ("scale",)}  # other names
 
 
 def load_toml(path: Path) -> dict[str, Any]:
@@ -310,22 +320,25 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
     for item in error.errors(include_url=False):
         loc = [part for i, part in enumerate(item["loc"]) if not _is_tag(item["loc"], i)]
         keys = [*([prefix] if prefix else []), *[str(part) for part in loc]]
-        dotted = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(keys)) or model.__name__
+        dotted = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(keys))
         where = f"{path}:{number}" if (number := line_of(text, keys)) else str(path)
+        where += f": {dotted}" if dotted else ""  # what concerns the whole file names its keys itself
         if item["type"] == "extra_forbidden":
-            close = difflib.get_close_matches(keys[-1], known_keys(model, item["loc"][:-1]), 1)
-            lines.append(f"{where}: {dotted}: unknown key" + (f"; did you mean {close[0]}?" if close else ""))
+            known = known_keys(model, item["loc"][:-1])
+            meant = [name for name in MEANT.get(keys[-1], ()) if name in known]
+            close = meant or difflib.get_close_matches(keys[-1], known, 1)
+            lines.append(f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else ""))
         elif item["type"] == "missing":
-            lines.append(f"{where}: {dotted}: missing; it is required")
+            lines.append(f"{where}: missing; it is required")
         elif isinstance(item["input"], str) and item["input"].startswith("TODO"):  # as insitu init writes them
-            lines.append(f"{where}: {dotted}: still to be filled in: {item['input'].removeprefix('TODO').lstrip(': ')}")
+            lines.append(f"{where}: still to be filled in: {item['input'].removeprefix('TODO').lstrip(': ')}")
         elif item["type"] == "probe_kind":
             stated = item["input"].get("kind") if isinstance(item["input"], dict) else item["input"]
             lines.append(f"{where}: probe.kind: is {stated!r}; {item['msg']}")
         else:
             message = item["msg"].removeprefix("Value error, ")
             found = "" if item["type"] == "value_error" else f"is {item['input']!r}; expected: "
-            lines.append(f"{where}: {dotted}: {found}{message}")
+            lines.append(f"{where}: {found}{message}")
     return lines
 
 

@@ -37,6 +37,44 @@ def feet(wishes: dict[str, Any], plane: Plane) -> np.ndarray:
     return np.array([foot(wish, plane) for wish in wishes["object"]])
 
 
+OFF_PLANE_M, OFF_PLANE_REL = 1e-3, 0.01  # of its height, the larger: so far an object may be off the plane in silence
+
+
+def clearances(wishes: dict[str, Any], plane: Plane) -> dict[str, tuple[float, float]]:
+    """Height [m] over the plane of each object's lowest vertex, negative below it, and its own height [m] across it.
+
+    Raises ManifestError for a file that cannot be read.
+    """
+    found = {}
+    for wish in wishes["object"]:
+        placed = world_from_object(wish, plane)
+        vertices = np.concatenate([mesh.vertices for mesh in load_meshes(Path(wish["path"]))[0]])
+        heights = (vertices @ placed[:3, :3].T + placed[:3, 3]) @ plane.normal - plane.offset_m
+        found[wish["name"]] = float(heights.min()), float(np.ptp(heights))
+    return found
+
+
+def off_plane(wishes: dict[str, Any], found: dict[str, tuple[float, float]]) -> tuple[list[str], list[dict[str, Any]]]:
+    """Warnings of objects that `clearances` found to be sunk, or to float unasked; evidence of those lifted."""
+    warnings, evidence = [], []
+    for wish in wishes["object"]:
+        lowest, height = found[wish["name"]]
+        if abs(lowest) <= max(OFF_PLANE_M, OFF_PLANE_REL * height):
+            continue
+        where = f"object {wish['name']}: its lowest point is {1e3 * abs(lowest):.3g} mm"
+        if lowest < 0:
+            warnings.append(f"{where} below the plane; lift_m = {wish['lift_m'] - lowest:.4g} puts it on")
+        elif not wish["lift_m"]:
+            warnings.append(f"{where} above the plane: it floats; lift_m = {-lowest:.4g} puts it on")
+        else:
+            evidence.append({
+                "term": f"{wish['name']} off the plane", "modelled": True,
+                "because": f"lift_m = {wish['lift_m']:g}: its lowest point is {1e3 * lowest:.3g} mm above the plane",
+                "could_cost": "a shadow apart from the object, where it was meant to stand",
+            })  # fmt: skip
+    return warnings, evidence
+
+
 def turns_around(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -> float:
     """How often a surface encloses a point (3,): 1 or -1 inside a solid, 0 outside, between where it has a hole.
 
