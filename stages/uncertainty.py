@@ -210,7 +210,9 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
         elif pattern.lamps is not None:
             narrow = pattern.lamps
-            apart = studio.seen(narrow.rgb, narrow.emitters).minus(whole)
+            # Of shadows alone: a highlight narrower than the grid's squares would be met by chance, and keeps its sum.
+            lost = studio.seen(narrow.rgb, narrow.emitters).lost - whole.lost
+            apart = Seen(lost, np.zeros_like(lost), np.zeros_like(lost))
             share = (studio.upward(narrow.rgb) - studio.irradiance) / studio.irradiance
             change = response.of_turn(apart, share)
         else:
