@@ -27,8 +27,8 @@ from pipeline.trade.work import LAST, code_of, digest_of, source_of
 
 RUN, PILOT = "run.json", "pilot.json"
 TRUTH = {"object": "object_rel_err", "shadow": "shadow_change_err"}  # figure -> its name among evaluate's
-# Of what is asked, taken where it can be had: a run's own records say up to 2 % more than was predicted (desk, 64 samples)
-# and it would warn of what it was solved for.
+# Of what is asked, taken where it can be had: a run's own records say up to 2 % more than was predicted (desk), and it
+# would warn of what it was solved for.
 MARGIN = 0.95
 Say = Callable[[str], None]
 
