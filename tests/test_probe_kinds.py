@@ -224,7 +224,7 @@ HEAD = 'name = "k"\n[plate]\nfiles = ["a.dng"]\n[camera]\ngiven = { fx = 1.0 }\n
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('[probe]\nkind = "mapp"\n', r"toml:6: probe\.kind: is 'mapp'; expected one of mirror_ball, "),
+        ('[probe]\nkind = "mapp"\n', r"toml:7: probe\.kind: is 'mapp'; expected one of mirror_ball, "),
         ('[probe]\nkind = "map"\n', r"toml:6: probe\.file: missing"),
         ('[probe]\nkind = "map"\nfil = "a.hdr"\n', r"toml:8: probe\.fil: unknown key; did you mean file\?"),
         ('[probe]\nkind = "map"\nfile = "a.hdr"\nclipped_at = -1\n', r"toml:9: probe\.clipped_at: is -1"),

@@ -320,6 +320,7 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
     for item in error.errors(include_url=False):
         loc = [part for i, part in enumerate(item["loc"]) if not _is_tag(item["loc"], i)]
         keys = [*([prefix] if prefix else []), *[str(part) for part in loc]]
+        keys += ["kind"] if item["type"] == "probe_kind" else []  # it is the union's place that pydantic names
         dotted = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(keys))
         where = f"{path}:{number}" if (number := line_of(text, keys)) else str(path)
         where += f": {dotted}" if dotted else ""  # what concerns the whole file names its keys itself
@@ -334,7 +335,7 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
             lines.append(f"{where}: still to be filled in: {item['input'].removeprefix('TODO').lstrip(': ')}")
         elif item["type"] == "probe_kind":
             stated = item["input"].get("kind") if isinstance(item["input"], dict) else item["input"]
-            lines.append(f"{where}: probe.kind: is {stated!r}; {item['msg']}")
+            lines.append(f"{where}: is {stated!r}; {item['msg']}")
         else:
             message = item["msg"].removeprefix("Value error, ")
             found = "" if item["type"] == "value_error" else f"is {item['input']!r}; expected: "
