@@ -36,7 +36,8 @@ def test_a_preset_is_what_was_measured(recorded, name):
     for stage, knobs in PRESETS[name].items():
         measured = found["settings"][stage]
         assert {knob: measured.get(knob) for knob in knobs} == {knob: now[stage][knob] for knob in knobs}, stage
-    assert found["front"]["changed_rel_err"], f"{name}: another point costs less and errs less"
+    for figure, better in found["beaten_by"].items():
+        assert not better, f"{name}, {figure}: {', '.join(better)} cost less and err less, both beyond chance"
 
 
 def test_a_better_preset_costs_more_and_errs_less(recorded):

@@ -84,7 +84,7 @@ def test_parts_add_as_squares_and_each_falls_with_its_knob():
     for figure, parts in found.parts(Setting(8, 1024)).items():
         assert parts["all"] == pytest.approx(math.hypot(*(value for name, value in parts.items() if name != "all")))
         assert parts["map"] == RECORD["map"][figure] / 2
-        assert parts["lamp"] == RECORD["lamps"][figure]  # of every width: no map makes a lamp surer
+        assert parts["lamp"] == model.EXPECTED * RECORD["lamps"][figure]  # of every width: no map makes a lamp surer
         assert found.parts(Setting(32, 1024))[figure]["sampling"] == pytest.approx(parts["sampling"] / 2)
     assert found.stated == {"object": pytest.approx(0.005), "shadow": pytest.approx(0.006)}
     costs = [found.seconds(Setting(n, width)) for n, width in ((8, 512), (16, 512), (16, 1024), (512, 2048))]

@@ -123,6 +123,19 @@ def test_noise_is_the_spread_of_base_and_repeats():
     assert front.noise(ROWS[2:])["cpu_seconds"] is None  # one run has no spread
 
 
+def test_a_point_is_beaten_by_what_is_cheaper_and_better_beyond_chance():
+    """Costs scatter by 1, errors by 0.001: two standard deviations of a difference are 2.8 and 0.0028."""
+    same = {"kind": "base", "label": "base", "cpu_seconds": 30.0, "errors": {"changed_rel_err": 0.02}}
+    rows = [row for row in ROWS if row["kind"] in ("base", "repeat")]
+    tried = {"both": (20.0, 0.010), "cost by chance": (28.0, 0.010), "error by chance": (20.0, 0.018)}
+    rows += [
+        same | {"kind": "knob", "label": label, "cpu_seconds": cost, "errors": {"changed_rel_err": error}}
+        for label, (cost, error) in tried.items()
+    ]
+    assert front.beaten_by(same, rows, "changed_rel_err") == ["both"]
+    assert front.beaten_by(same, rows, "object_rel_err") == []
+
+
 def test_what_a_knob_buys_is_against_the_base_and_says_what_may_be_chance():
     """A difference of two runs has sqrt(2) of the spread: 2.8 CPU s and 0.0028 are two of its standard deviations."""
     table = {(entry["knob"], entry["value"]): entry for entry in front.buys(ROWS)}

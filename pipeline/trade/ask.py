@@ -21,7 +21,7 @@ from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build, is_complete
 from pipeline.run.settings import Settings
 from pipeline.trade import model
-from pipeline.trade.model import FIGURES, FINEST, PILOT_WIDTH, Model, Setting
+from pipeline.trade.model import EXPECTED, FIGURES, FINEST, PILOT_WIDTH, Model, Setting
 from pipeline.trade.pilot import FEW, Pilot, flux_sigma, stated
 from pipeline.trade.work import LAST, code_of, digest_of, source_of
 
@@ -240,7 +240,7 @@ def posterior(build: Build, predicted: Mapping[str, Any], pilot: Mapping[str, An
             "sampling": old["sampling"] * ratio,
             "map": old["map"],
             "lamp": old["lamp"] * surer,
-            "stated": math.hypot(0.0, *anew[figure].values()),
+            "stated": EXPECTED * math.hypot(0.0, *anew[figure].values()),
         }
         found[figure] = parts | {"all": math.hypot(*parts.values())}
     return found

@@ -44,6 +44,21 @@ def fronts(rows: Sequence[Row], figure: str) -> list[bool]:
     )  # fmt: skip
 
 
+def beaten_by(row: Row, rows: Sequence[Row], figure: str) -> list[str]:
+    """Labels of the rows that cost less than ``row`` and err less by one figure, both beyond chance.
+
+    Near the front many settings differ by less than repeats do, and which of them `fronts` names is chance.
+    """
+    sigma, ours = noise(rows), row["errors"].get(figure)
+    return [
+        other["label"]
+        for other in rows
+        if is_measured(other) and None not in (ours, theirs := other["errors"].get(figure))
+        and (saved := row["cpu_seconds"] - other["cpu_seconds"]) > 0 and resolved(saved, sigma["cpu_seconds"])
+        and (gain := ours - theirs) > 0 and resolved(gain, sigma[figure])
+    ]  # fmt: skip
+
+
 def is_measured(row: Row) -> bool:
     """Whether a row is a point of its own with results: no failure, no repeat."""
     return "failed" not in row and row["kind"] != "repeat"

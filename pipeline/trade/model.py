@@ -9,6 +9,7 @@ lamp        what the stated sigmas of the lamps' flux do to a pixel, by a pilot 
             settings, as how a photograph samples a lamp is not the map's doing (desk: 6.6, 6.5, 6.6 % at 512 to 2048)
 stated      the other standard uncertainties of the stages before (exposures, ball, light, plate), for all settings
 
+Of the last two, `EXPECTED` of the standard uncertainty: the error that a run has in the mean, not its root mean square.
 Of what is no more than bounded (near field, what a photograph cannot show) nothing is in it. Costs are CPU seconds of
 all threads, of the stages up to the composite.
 """
@@ -38,6 +39,9 @@ STARTING = 0.5  # CPU seconds of a render whatever its size: shapes, tables of t
 BY_SAMPLES = 0.5  # of a pilot render of few samples: what grows with them; measured as soon as there are two
 FEWER_TRACED = 0.25  # the traced share falls with a picture's side to this power: desk at 256, 512, 1024 px
 RATE = 0.5  # noise falls with the samples to this power: variances of independent samples add
+# E|x| of a normal error of one sigma. What all pixels share moves their median as a whole: a run errs by its absolute
+# value, in the mean this much of its standard uncertainty. Over many pixels sampling is a median already.
+EXPECTED = math.sqrt(2 / math.pi)
 LEAST = 1e-9  # difference of two pictures, so that logarithms exist
 
 
@@ -142,8 +146,8 @@ class Model:
             parts = {
                 "sampling": noise.at(setting.samples),
                 "map": self.map_error.get(figure, 0.0) * self.width / setting.width,
-                "lamp": self.lamp.get(figure, 0.0),
-                "stated": self.stated.get(figure, 0.0),
+                "lamp": EXPECTED * self.lamp.get(figure, 0.0),
+                "stated": EXPECTED * self.stated.get(figure, 0.0),
             }
             found[figure] = parts | {"all": math.hypot(*parts.values())}
         return found

@@ -48,17 +48,23 @@ def write(root: Path, rows: Sequence[Row], about: dict[str, Any]) -> list[Path]:
 
 
 def presets(rows: Sequence[Row], about: dict[str, Any]) -> dict[str, Any]:
-    """What the presets were when they were measured, their figures, costs and fronts, and the run that they are of."""
+    """What the presets were when they were measured, their figures, costs and fronts, and the run that they are of.
+
+    ``beaten_by``: per figure, the points that cost less and err less, both beyond chance.
+    """
     known = {row["label"]: row for row in rows if row["kind"] in ("base", "preset") and "failed" not in row}
     kept = ("errors", "cpu_seconds", "seconds", "peak_mb", "front")
     return {
         **{key: about.get(key) for key in ("id", "capture", "against", "cores", "machine", "load", "noise")},
         "points": len([row for row in rows if front.is_measured(row)]),
         "presets": {
-            name: {"settings": about.get("presets", {}).get(name), **{key: row[key] for key in kept}}
+            name: {
+                "settings": about.get("presets", {}).get(name), **{key: row[key] for key in kept},
+                "beaten_by": {figure: front.beaten_by(row, rows, figure) for figure in front.FIGURES},
+            }
             for name, row in known.items()
         },
-    }
+    }  # fmt: skip
 
 
 def load_words(about: dict[str, Any]) -> str:
@@ -112,11 +118,40 @@ def markdown(rows: Sequence[Row], about: dict[str, Any]) -> str:
         "Settings that none beats in both CPU seconds and error of all changed pixels.",
         "",
     ]
-    lines += [*points_table(sorted(on_front, key=lambda row: row["cpu_seconds"])), ""]
+    lines += [*points_table(sorted(on_front, key=lambda row: row["cpu_seconds"])), "", *preset_words(rows), ""]
     lines += ["## Every point", "", *points_table([row for row in rows if "failed" not in row]), ""]
     if failed := [row for row in rows if "failed" in row]:
         lines += ["## Refused", "", *(f"- `{row['label']}`: {row['failed']}" for row in failed), ""]
     return "\n".join(lines)
+
+
+def preset_words(rows: Sequence[Row]) -> list[str]:
+    """Of each preset: cheaper points that are better beyond chance, and those that are no worse beyond chance."""
+    lines, sigma = [], front.noise(rows)
+    for row in rows:
+        if row["kind"] not in ("base", "preset") or "failed" in row or row["errors"].get(front.MAIN) is None:
+            continue
+        better = sorted({label for figure in front.FIGURES for label in front.beaten_by(row, rows, figure)})
+        alike = [
+            f"`{other['label']}` ({other['cpu_seconds']:.1f} CPU s)"
+            for other in rows
+            if front.is_measured(other) and other["cpu_seconds"] < row["cpu_seconds"]
+            and front.resolved(row["cpu_seconds"] - other["cpu_seconds"], sigma["cpu_seconds"])
+            and all(is_no_worse(row, other, figure, sigma[figure]) for figure in front.FIGURES)
+        ]  # fmt: skip
+        said = f"better beyond chance: {', '.join(better)}" if better else "none is better beyond chance"
+        lines.append(
+            f"- `{row['label']}`: of the cheaper points {said}"
+            + (f"; no worse in any figure beyond chance: {', '.join(alike)}" if alike else "")
+            + "."
+        )
+    return lines
+
+
+def is_no_worse(row: Row, other: Row, figure: str, sigma: float | None) -> bool:
+    """Whether another row's error is not above the row's by more than chance; so too where one has no such figure."""
+    ours, theirs = row["errors"].get(figure), other["errors"].get(figure)
+    return None in (ours, theirs) or theirs <= ours or not front.resolved(theirs - ours, sigma)
 
 
 def noise_words(about: dict[str, Any]) -> str:
