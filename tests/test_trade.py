@@ -449,9 +449,9 @@ def test_a_relative_folder_is_meant_from_where_the_command_was_given(toy, tmp_pa
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(work.subprocess, "Popen", Child)
-    work.Bench._run(toy, Point("preview", "base", "preview"), Path("out/trade/work/one"))
-    assert told[told.index("--out") + 1] == str((tmp_path / "out/trade/work/one").resolve())
-    assert (tmp_path / "out/trade/work/one/log.txt").exists()
+    work.Bench._run(toy, Point("preview", "base", "preview"), Path("out/trade/points/one"))
+    assert told[told.index("--out") + 1] == str((tmp_path / "out/trade/points/one").resolve())
+    assert (tmp_path / "out/trade/points/one/log.txt").exists()
 
 
 def test_interrupted_keeps_what_is_done(toy):
