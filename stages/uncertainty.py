@@ -10,6 +10,7 @@ objects reflect is taken as wished; what no stage states an uncertainty for is n
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
 from pipeline.transport.placing import place_objects
-from pipeline.transport.scene import Worlds, build_worlds
+from pipeline.transport.scene import Worlds, build_worlds, relit
 from pipeline.transport.trace import LensRays
 from pipeline.types import Balance, BallFit, Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
@@ -130,19 +131,28 @@ class Studio:
         """Irradiance (3,) on the plane."""
         return np.asarray(irradiance(rgb, self.plane.normal[None])[0])
 
-    def worlds(self, rgb: np.ndarray, emitters: list[Emitter], ground: float = 1.0) -> Worlds:
-        """The scene under a map, its real surfaces ``ground`` times as bright."""
+    @functools.cached_property
+    def lit(self) -> Worlds:
+        """The scene under the whole light."""
+        return self.worlds(1.0)
+
+    def worlds(self, ground: float) -> Worlds:
+        """The scene under the whole light, its real surfaces ``ground`` times as bright."""
         proxies = [
             proxy if proxy.albedo is None else proxy.model_copy(update={"albedo": ground * proxy.albedo})
             for proxy in self.proxies
         ]
         return build_worlds(
-            self.plane, ground * self.albedo, rgb, self.dark, proxies, emitters, self.surface, self.occluders
+            self.plane, ground * self.albedo, self.rgb, self.dark, proxies, self.emitters, self.surface, self.occluders
         )
 
-    def seen(self, rgb: np.ndarray, emitters: list[Emitter], ground: float = 1.0) -> Seen:
+    def under(self, rgb: np.ndarray, emitters: list[Emitter]) -> Seen:
+        """A render under another map; surfaces are the same."""
+        return self.seen(relit(self.lit, rgb, emitters))
+
+    def seen(self, worlds: Worlds) -> Seen:
         """A render."""
-        return rendered(self.worlds(rgb, emitters, ground), self.rays, self.grid, self.samples, DEPTH, seed=1)
+        return rendered(worlds, self.rays, self.grid, self.samples, DEPTH, seed=1)
 
 
 def rms(variance: np.ndarray) -> np.ndarray:
@@ -199,19 +209,19 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
     """What each pattern makes of the composite."""
     if not followed:
         return []
-    whole = studio.seen(studio.rgb, studio.emitters)
-    response = Response(studio.grid, full, whole, studio.seen(studio.rgb, studio.emitters, DIMMER))
+    whole = studio.seen(studio.lit)
+    response = Response(studio.grid, full, whole, studio.seen(studio.worlds(DIMMER)))
     modes = []
     for pattern in followed:
         if pattern.factor is not None:
             change = response.of_factor(pattern.factor)
         elif pattern.radiance is not None:
-            seen = studio.seen(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
+            seen = studio.under(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
             change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
         elif pattern.lamps is not None:
             narrow = pattern.lamps
             # Of shadows alone: a highlight narrower than the grid's squares would be met by chance, and keeps its sum.
-            lost = studio.seen(narrow.rgb, narrow.emitters).lost - whole.lost
+            lost = studio.under(narrow.rgb, narrow.emitters).lost - whole.lost
             apart = Seen(lost, np.zeros_like(lost), np.zeros_like(lost))
             share = (studio.upward(narrow.rgb) - studio.irradiance) / studio.irradiance
             change = response.of_turn(apart, share)
@@ -220,7 +230,7 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             angle = float(np.linalg.norm(pattern.turn))
             step = pattern.turn * STEP_RAD / angle
             moved = light.turned(studio.rgb, step)
-            apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
+            apart = studio.under(moved, moved_emitters(studio, step)).minus(whole)
             share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
             change = angle / STEP_RAD * response.of_turn(apart, share)
         modes.append(pixels.Mode(pattern.name, pattern.source, change.astype(np.float32)))
@@ -241,7 +251,7 @@ def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
 def geometry_modes(studio: Studio, composite: Raster, plate: Raster, share: float) -> list[pixels.Mode]:
     """What pose and lens make of the composite: objects and shadows are drawn elsewhere, the plate stays."""
     grid, window = studio.grid, studio.grid.window
-    points, px, on_object = points_on(studio.worlds(studio.rgb, []), studio.rays, grid)
+    points, px, on_object = points_on(studio.lit, studio.rays, grid)
     if not len(points):
         return []
     alpha = composite["obj.A"][window][..., None]

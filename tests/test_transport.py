@@ -12,7 +12,7 @@ from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_d
 from pipeline.light.environment import irradiance
 from pipeline.transport.difference import difference_block
 from pipeline.transport.meshes import Material, Mesh
-from pipeline.transport.scene import Worlds, build_worlds, envmap_grid
+from pipeline.transport.scene import Worlds, build_worlds, envmap_grid, relit
 from pipeline.transport.surfaces import material_bsdf, mesh_shape
 from pipeline.transport.trace import Rays, reference_block, trace
 from pipeline.transport.variant import use_mitsuba
@@ -174,6 +174,25 @@ def test_difference_strategy_equals_the_reference(place: str) -> None:
     slow = [trace(reference_block, worlds, all_rays(), 64, 16, 100 + seed) for seed in range(REPEATS)]
     assert_same_mean([t.lost + t.gained for t in fast], [t.lost + t.gained for t in slow], SIZE)
     assert_same_mean([t.obj for t in fast], [t.obj for t in slow], SIZE)
+
+
+@pytest.mark.parametrize("place", ["plane", "lamp", "wall"])
+def test_surfaces_under_another_light_are_worlds_built_under_it(place: str) -> None:
+    """The same bytes as by building anew; the reference strategy, which asks the scenes' own light, refuses."""
+    mesh = sphere(0.1, (0, 0.1, 0), GREY)
+    shape = {"o": mesh_shape(use_mitsuba(), "o", mesh, np.eye(4), material_bsdf(use_mitsuba(), GREY, "acescg"))}
+    lit = local_scene(place)
+    other = sky()[:, ::-1] * [0.5, 1.0, 2.0]
+    emitters = lit.pop("emitters", [])
+    albedo = np.array([0.5, 0.3, 0.2])
+    first = build_worlds(ground(), albedo, sky(), shape, **lit)
+    moved, anew = relit(first, other, emitters), build_worlds(ground(), albedo, other, shape, emitters=emitters, **lit)
+    found, asked = (trace(difference_block, worlds, all_rays(), 4, 4, 0) for worlds in (moved, anew))
+    for name in ("obj", "lost", "gained", "albedo"):
+        assert np.array_equal(getattr(found, name), getattr(asked, name)), name
+    assert found.lost.any()
+    with pytest.raises(ValueError, match="another light"):
+        trace(reference_block, moved, all_rays(), 4, 4, 0)
 
 
 def test_an_occluder_hides_object_and_change_exactly() -> None:

@@ -7,8 +7,9 @@ passes through as arrays (`raw`), never through its colour conversions.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,7 @@ class Worlds:
     convex: bool = True
     diffuse: bool = True
     photons: float = 0.0  # for every sample of a pixel and every emitter: what camera paths leave to light tracing
+    own_light: bool = True  # whether the two scenes hold the same distant light as the groups
     occluders: Any = None  # scene of real things that hide the objects from the camera; they take no part in the light
 
     def is_local(self, hit: Any) -> Any:
@@ -68,12 +70,9 @@ class Worlds:
 
 def envmap_grid(rgb: np.ndarray) -> np.ndarray:
     """Our half-texel rows (H, W, 3) on Mitsuba's grid, where rows 0 and H - 1 are the poles; columns already agree."""
-    height = rgb.shape[0]
-    rows = np.arange(height + 1) / height * height - 0.5  # row r of H + 1 is at theta = pi r / H
-    low = np.clip(np.floor(rows).astype(int), 0, height - 1)
-    high = np.clip(low + 1, 0, height - 1)
-    weight = np.clip(rows - low, 0, 1)[:, None, None]
-    grid = rgb[low] * (1 - weight) + rgb[high] * weight
+    grid = np.empty((len(rgb) + 1, *rgb.shape[1:]))
+    np.add(rgb[:-1], rgb[1:], out=grid[1:-1])  # row r of H + 1 is at theta = pi r / H: midway between two of ours
+    grid[1:-1] *= 0.5
     grid[0], grid[-1] = rgb[0].mean(0), rgb[-1].mean(0)
     return grid
 
@@ -106,9 +105,14 @@ def ground_texture(mi: Any, albedo: np.ndarray) -> dict[str, Any]:
 
 def above_plane(rgb: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """A map (H, W, 3) with nothing in texels that lie wholly below the plane: their light never reaches it."""
-    height, width = rgb.shape[:2]
+    return np.where(_reaches(*rgb.shape[:2], np.asarray(normal, float).tobytes()), rgb, 0.0)
+
+
+@functools.lru_cache(maxsize=4)  # one plane, and maps of one or two sizes
+def _reaches(height: int, width: int, normal_bytes: bytes) -> np.ndarray:
+    """(H, W, 1) texels that lie above a plane, at least in part; its normal as the bytes of (3,) float64."""
     reach = np.hypot(np.pi / height, 2 * np.pi / width)
-    return np.where((latlong_directions(height, width) @ normal > -reach)[..., None], rgb, 0.0)
+    return (latlong_directions(height, width) @ np.frombuffer(normal_bytes) > -reach)[..., None]
 
 
 def bounding_sphere(shape: Any) -> np.ndarray:
@@ -118,17 +122,40 @@ def bounding_sphere(shape: Any) -> np.ndarray:
     return np.array([*(low + high) / 2, np.linalg.norm(high - low) / 2])
 
 
-def light_groups(mi: Any, environment: np.ndarray, emitters: Sequence[Emitter]) -> tuple[LightGroup, ...]:
-    """The environment (H, W, 3) as a partition of its texels: the sky, then each emitter."""
-    sky = environment.reshape(-1, 3).copy()
-    lamps = []
-    for emitter in emitters:
-        texels = np.asarray(emitter.texels, int)
-        alone = np.zeros_like(sky)
-        alone[texels] = sky[texels]
-        sky[texels] = 0.0
-        lamps.append(light_group(mi, emitter.name, alone.reshape(environment.shape), emitter))
-    return (light_group(mi, "sky", sky.reshape(environment.shape)), *lamps)
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The distant light as `Worlds` holds it."""
+
+    lights: tuple[LightGroup, ...]
+    whole: LightGroup
+    lights_above: tuple[LightGroup, ...]
+
+
+def distant_light(
+    mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray, convex: bool
+) -> Light:
+    """The environment (H, W, 3) as a partition of its texels: the sky, then each emitter; and all of it.
+
+    For the local scene the sky is parted at the plane, so that no sample meant for the plane is lost on what lies
+    below; unless ``convex`` that part is kept, for other surfaces.
+    """
+    sky, lamps = environment, []
+    if emitters:
+        sky = environment.copy()
+        flat = sky.reshape(-1, 3)
+        for emitter in emitters:
+            texels = np.asarray(emitter.texels, int)
+            alone = np.zeros(sky.shape)
+            alone.reshape(-1, 3)[texels] = flat[texels]
+            flat[texels] = 0.0
+            lamps.append(light_group(mi, emitter.name, alone, emitter))
+    above = above_plane(sky, normal)
+    parts = [light_group(mi, "sky", above)]
+    if not convex:
+        parts.append(light_group(mi, "below", sky - above))
+    everywhere = light_group(mi, "sky", sky)
+    whole = light_group(mi, "all", environment) if emitters else LightGroup("all", everywhere.scene)
+    return Light((everywhere, *lamps), whole, (*parts, *lamps))
 
 
 def light_group(mi: Any, name: str, radiance: np.ndarray, emitter: Emitter | None = None) -> LightGroup:
@@ -136,15 +163,13 @@ def light_group(mi: Any, name: str, radiance: np.ndarray, emitter: Emitter | Non
     return LightGroup(name, mi.load_dict({"type": "scene", "distant": environment_emitter(mi, radiance)}), emitter)
 
 
-def sky_parts(
-    mi: Any, environment: np.ndarray, emitters: Sequence[Emitter], normal: np.ndarray
-) -> tuple[LightGroup, LightGroup]:
-    """The sky above the plane, and what lies below it: no sample that is meant for the plane is lost on that."""
-    sky = environment.copy()
-    for emitter in emitters:
-        sky.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0.0
-    above = above_plane(sky, normal)
-    return light_group(mi, "sky", above), light_group(mi, "below", sky - above)
+def relit(worlds: Worlds, environment: np.ndarray, emitters: Sequence[Emitter] = ()) -> Worlds:
+    """The same surfaces under another distant light, for the difference strategy: it asks the light groups alone.
+
+    The two scenes keep the light that they were built with; the reference strategy, which asks them, refuses.
+    """
+    light = distant_light(worlds.mi, environment, emitters, worlds.plane.normal, worlds.convex)
+    return replace(worlds, **vars(light), own_light=False)
 
 
 def ground_bsdf(mi: Any, albedo: np.ndarray, surface: Surface | None) -> dict[str, Any]:
@@ -207,17 +232,14 @@ def build_worlds(
         shapes |= {f"proxy_{proxy.name}": proxy_shape(mi, proxy, proxy.albedo) for proxy in proxies}
         scenes.append((mi.load_dict({**shared, **shapes, **synthetic}), tuple(shapes.values())))
     (with_objects, local_with), (without, _) = scenes
-    lights = light_groups(mi, environment, emitters)
-    above, below = sky_parts(mi, environment, emitters, plane.normal)
+    light = distant_light(mi, environment, emitters, plane.normal, convex=not proxies)
     hiding = {f"occluder_{o.name}": proxy_shape(mi, o, None) for o in occluders if o.vertices_m is not None}
     return Worlds(
         mi=mi,
         with_objects=with_objects,
         without_objects=without,
         local_with=local_with,
-        lights=lights,
-        whole=light_group(mi, "all", environment),
-        lights_above=(above, below, *lights[1:]) if proxies else (above, *lights[1:]),
+        **vars(light),
         plane=plane,
         bounds=np.array([bounding_sphere(shape) for shape in objects.values()]).reshape(-1, 4),
         convex=not proxies,

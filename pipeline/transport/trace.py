@@ -241,6 +241,12 @@ def camera_hits(worlds: Worlds, rays: Rays, samples: int, jitter: Any, footprint
     return ray, hit, seen & ~local, seen & local
 
 
+def require_own_light(worlds: Worlds) -> None:
+    """Raise ValueError for worlds of `pipeline.transport.scene.relit`, whose scenes hold another light."""
+    if not worlds.own_light:
+        raise ValueError("worlds: their scenes hold another light than their groups; build them under this light")
+
+
 def reference_block(
     worlds: Worlds, rays: Rays, samples: int, depth: int, seed: int, footprint_px: float, roulette: int = NEVER
 ) -> Samples:
@@ -250,6 +256,7 @@ def reference_block(
     """
     import drjit as dr
 
+    require_own_light(worlds)
     mi = worlds.mi
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": roulette})
     sampler = make_sampler(mi, samples)
@@ -282,6 +289,7 @@ def unchanged_block(worlds: Worlds, rays: Rays, samples: int, depth: int, seed: 
     """LS_noobj alone, path traced, where no object hides the local scene: for scenes without a closed form."""
     import drjit as dr
 
+    require_own_light(worlds)
     mi = worlds.mi
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": NEVER})
     sampler = make_sampler(mi, samples)
