@@ -219,14 +219,20 @@ def reason(view: str, balance: Balance, numbers: dict[str, Any], own: bool) -> d
             f"{', '.join(balance.references)}: gains {gains}, chi2 {numbers['chi2']:.1f} against 1 (needs "
             f"{estimate.SIGNIFICANT_CHI2:g})"
         )
-        cost = f"at most {np.abs(np.log(balance.gains)).max():.1%} of the light's scale"
+        bound = float(np.abs(np.log(balance.gains)).max())
+        cost = f"at most {bound:.1%} of the light's scale"
     elif own:
         because = "unknown: another camera than the plate's, and no reference that both saw"
+        bound = 2 * float(np.hypot(sigma, COLOUR_SIGMA))
         cost = f"about {sigma:.0%} of the light's scale and {COLOUR_SIGMA:.0%} of its colour; lay a grey card in both"
     else:
         because = "one camera, and no reference that both saw"
+        bound = 2 * sigma
         cost = f"the exposures' uncertainty, {sigma:.2%}"
-    return {"term": f"balance of {view}", "modelled": balance.applied, "because": because, "could_cost": cost}
+    return {
+        "term": f"balance of {view}", "modelled": balance.applied, "because": because, "could_cost": cost,
+        "bound_rel": bound,
+    }  # fmt: skip
 
 
 def matrix_reason(view: str, pair: Pair) -> dict[str, Any]:
@@ -236,6 +242,7 @@ def matrix_reason(view: str, pair: Pair) -> dict[str, Any]:
         "modelled": False,
         "because": f"three gains leave {pair.residual:.1%} rms on the colours of {pair.name}",
         "could_cost": f"{pair.residual:.1%} of saturated colours, nothing of greys",
+        "bound_rel": 2 * pair.residual,
     }
 
 
@@ -247,6 +254,7 @@ def neutral_reason(grey: estimate.Gains) -> dict[str, Any]:
         "modelled": False,
         "because": f"the picture is the photographer's; its grey differs by {cast:.1%} between channels",
         "could_cost": "nothing: plate and light share it; corrections.ccc holds plate_to_neutral",
+        "bound_rel": 0.0,
     }
 
 

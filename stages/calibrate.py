@@ -240,6 +240,7 @@ def judge(
         "because": f"residuals averaged over {shape.cells} cells of the frame: so large without a pattern in "
         f"{shape.chance:.2g} of sets",
         "could_cost": f"{shape.rms_px:.3f} px rms over the frame, {shape.largest_px:.3f} px at most",
+        "bound_px": float(shape.largest_px),
     }  # fmt: skip
     return Result({"camera": camera}, numbers, warnings, [*evidence, beyond])
 

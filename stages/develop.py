@@ -121,6 +121,7 @@ def _interpolation(view: str, numbers: dict[str, float]) -> dict[str, Any]:
         "modelled": False,
         "because": f"it is no noise; beyond the noise in {numbers['beyond_noise_fraction']:.0%} of {view}'s middle",
         "could_cost": f"values there are off by {numbers['median_rel']:.1%} (median), {numbers['p95_rel']:.1%} (95 %)",
+        "bound_rel": numbers["p95_rel"],
     }
 
 
@@ -256,6 +257,7 @@ def _one_matrix(profile: dict[str, Any]) -> dict[str, Any]:
         "modelled": False,
         "because": f"{profile['camera'] or profile['file']} carries one ColorMatrix",
         "could_cost": "colour error of 1 to 3 delta E under light far from the calibration illuminant",
+        "no_bound": "a difference of colour, delta E, is no share of light",
     }
 
 
@@ -265,6 +267,7 @@ def _known_space(profile: dict[str, Any]) -> dict[str, Any]:
         "modelled": False,
         "because": f"{profile['file']} is not camera_rgb but {profile['space']}, as whoever developed it says",
         "could_cost": "what that development did to colours: its white balance and its matrix are taken as they are",
+        "no_bound": "nothing in the file tells what was done to it",
     }
 
 

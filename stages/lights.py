@@ -17,6 +17,7 @@ from pipeline.light.alike import flux_sigma
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.environment import total_energy
 from pipeline.run.artifacts import EMITTERS, ENVIRONMENT
+from pipeline.run.evidence import TRIED
 from pipeline.run.stage import Stage
 from pipeline.types import Emitter, Raster, Result
 from stages import knobs
@@ -118,14 +119,16 @@ def evidence(
             "modelled": False,
             "because": f"{name(patch)}, wider than {params.max_half_angle_deg:g}",
             "could_cost": "nothing: its shadow is soft, and the sky is sampled by brightness",
+            "bound_rel": 0.0,
         }
         for patch in wide
     ]
     if not rows:
         because = f"no narrow patch that stands out holds {params.min_share:.1%} of the light"
-        rows.append(
-            {"term": "lights apart from the sky", "modelled": False, "because": because, "could_cost": "nothing"}
-        )
+        rows.append({
+            "term": "lights apart from the sky", "modelled": False, "because": because, "could_cost": "nothing",
+            "bound_rel": 0.0, **TRIED,
+        })  # fmt: skip
     return rows
 
 

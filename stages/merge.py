@@ -49,6 +49,7 @@ from pipeline.image.optical_black import OpticalBlack
 from pipeline.image.radiometry import Exposed, Merged
 from pipeline.image.raw import read_sensor
 from pipeline.run.artifacts import BRACKETS, EXPOSURES, FACTS, MOSAICS
+from pipeline.run.evidence import TRIED
 from pipeline.run.stage import Stage
 from pipeline.types import Bracket, Frame, Raster, Result
 from stages import knobs
@@ -388,6 +389,7 @@ def _evidence(
             "modelled": sources != ["assumed"],
             "because": f"source: {', '.join(sources)}",
             "could_cost": "weights and variances off; radiance stays unbiased",
+            "no_bound": "the sensor's noise is nowhere described",
         },
         {
             "term": "knee below the clip level",
@@ -396,6 +398,8 @@ def _evidence(
             if knees
             else "no departure of 0.5 % where frames overlap",
             "could_cost": "up to 0.5 % in the last tenths of a frame's range",
+            "bound_rel": 0.005,
+            **TRIED,
         },
         _pattern_evidence(patterns),
         bracket_exposure.label_evidence(labels, exposures),
@@ -405,24 +409,32 @@ def _evidence(
             "modelled": False,
             "because": f"chi-square beyond noise in {ghosts:.3%} of the worst view; flagged, variance raised",
             "could_cost": "a mixture of states in flagged pixels",
+            **({"no_bound": "what stood there in either state is not known"} if ghosts else {"bound_rel": 0.0}),
         },
     ]
+
+
+UNKNOWN_PRNU = 0.01  # of the sensors of cameras, 0.5 to 1 %
 
 
 def _pattern_evidence(patterns: Mapping[str, FixedPattern]) -> dict[str, Any]:
     """The sensor's fixed pattern: what is known of it, and what not knowing it could cost."""
     known = [pattern for pattern in patterns.values() if pattern.believed]
     if known:
-        because = f"{known[0].prnu:.2%} +- {known[0].prnu * known[0].sigma:.2%}: {known[0].because}"
+        prnu = known[0].prnu
+        because = f"{prnu:.2%} +- {prnu * known[0].sigma:.2%}: {known[0].because}"
         cost = "variance of bright parts"
     elif patterns:
         bound = min(patterns.values(), key=lambda pattern: pattern.prnu)
-        because = f"at most {bound.prnu:.2%}: {bound.because}"
+        prnu, because = bound.prnu, f"at most {bound.prnu:.2%}: {bound.because}"
         cost = f"up to {bound.prnu:.2%} of each bright photosite beyond the stated variance; state prnu in [[noise]]"
     else:
-        because = "no flat and bright part to measure it"
+        prnu, because = UNKNOWN_PRNU, "no flat and bright part to measure it"
         cost = "about 0.5 to 1 % of each bright photosite beyond the stated variance; state prnu in [[noise]]"
-    return {"term": "fixed pattern (PRNU)", "modelled": bool(known), "because": because, "could_cost": cost}
+    return {
+        "term": "fixed pattern (PRNU)", "modelled": bool(known), "because": because, "could_cost": cost,
+        "bound_rel": float(prnu),
+    }  # fmt: skip
 
 
 STAGE = Stage(

@@ -95,7 +95,11 @@ def compute(
         table = beside(cloud, corners, found.uneven_m, objects, proxies, environment, emitters, camera, view, params)
         numbers["surfaces"] = rows = [row for row, _ in table]
         surroundings += [proxy for row, proxy in table if row["modelled"]]
-    terms = [*evidence(view, shown), extent_evidence(extent), beside_evidence(proxies, rows)]
+    uneven_px = 0.0
+    if shown is not None:
+        height = max(map(abs, shown["height_m"].values())) + 2 * shown["uneven_m"]
+        uneven_px = moved_by_height(height, list(spots.values()), view, camera, emitters)
+    terms = [*evidence(view, shown, uneven_px), extent_evidence(extent), beside_evidence(proxies, rows)]
     return Result({"plane": plane, "surroundings": surroundings}, numbers, warnings, terms)
 
 
@@ -281,10 +285,24 @@ def plane_covariance(view: View) -> np.ndarray:
     return by_pose @ view.covariance @ by_pose.T
 
 
-def evidence(view: View, cloud: dict[str, Any] | None = None) -> list[dict[str, Any]]:
-    """The model ladder of the plane; ``cloud``: figures of what further views show of it."""
+def moved_by_height(
+    height_m: float, spots: list[np.ndarray], view: View, camera: Camera, emitters: list[Emitter]
+) -> float:
+    """How far [px] contact and shadow are off at the nearest foot (3,) if the surface there lies higher or lower.
+
+    A shadow moves by the height times the cotangent of its lamp's elevation; without lamps it stays below.
+    """
+    nearest = min(float(np.linalg.norm(view.world_from_camera[:3, 3] - spot)) for spot in spots)
+    slopes = [float(np.hypot(*e.direction[[0, 2]]) / e.direction[1]) for e in emitters if e.direction[1] > 0]
+    return camera.fx * height_m / nearest * max([1.0, *slopes])
+
+
+def evidence(view: View, cloud: dict[str, Any] | None = None, uneven_px: float = 0.0) -> list[dict[str, Any]]:
+    """The model ladder of the plane; ``cloud``: what further views show of it; ``uneven_px`` by its heights."""
     uneven = "no points off the board are measured"
+    bound: dict[str, Any] = {"no_bound": uneven}
     if cloud is not None:
+        bound = {"bound_px": uneven_px}
         uneven = (
             f"{cloud['points']} points scatter by {1000 * cloud['scatter_m']:.2f} mm about a plane that is "
             f"{cloud['tilt_deg']:.3f} deg and {1000 * cloud['offset_m']:+.2f} mm off the markers' "
@@ -296,6 +314,7 @@ def evidence(view: View, cloud: dict[str, Any] | None = None) -> list[dict[str, 
             "term": "unevenness of the surface, paper thickness", "modelled": False,
             "because": uneven,
             "could_cost": "contact and shadow shift by the height error times the cotangent of the light's elevation",
+            **bound,
         },
     ]  # fmt: skip
 
@@ -311,6 +330,7 @@ def extent_evidence(extent: dict[str, Any]) -> dict[str, Any]:
         "term": "plane beyond the rectangle", "modelled": False, "because": because,
         "could_cost": f"at most {extent['left_out_bound']:.2%} of the light at its border in the frame, more where a "
         f"concave object focuses light; of what upright faces see of the ground, {FAR_SEEN:.0%} comes from the map",
+        "bound_rel": max(float(extent["left_out_bound"]), FAR_SEEN if extent["reach_m"] else 0.0),
     }  # fmt: skip
 
 
@@ -320,7 +340,8 @@ def beside_evidence(proxies: list[Proxy], surfaces: list[dict[str, Any]] | None)
     stated = f"{len(proxies)} described" if proxies else "no geometry was given"
     missing = "shadows on them and their light on the objects are missing"
     if surfaces is None:
-        return {**term, "modelled": bool(proxies), "because": stated, "could_cost": "" if proxies else missing}
+        row = {**term, "modelled": bool(proxies), "because": stated, "could_cost": "" if proxies else missing}
+        return row if proxies else row | {"no_bound": "nothing tells what stands there"}
     rows = [
         f"{row['name']} ({1e4 * row['area_m2']:.0f} cm2, {row['distance_m']:.2f} m off, changed by {row['change']:.1%} "
         f"and at most {row['change_bound']:.0%}): {row['because'] or 'modelled'}"
@@ -329,8 +350,9 @@ def beside_evidence(proxies: list[Proxy], surfaces: list[dict[str, Any]] | None)
     found = "; ".join(rows) or "no flat surface stands out of the cloud"
     left = [row["change"] for row in surfaces if not row["modelled"] and not row["described"]]
     cost = f"changes of up to {max(left):.1%} on surfaces left out" if left else "backs and sides that no view shows"
+    bound = {"bound_rel": float(max(left))} if left else {"no_bound": "nothing tells what no view shows"}
     modelled = bool(proxies) or any(row["modelled"] for row in surfaces)
-    return {**term, "modelled": modelled, "because": f"{stated}; {found}", "could_cost": cost}
+    return {**term, "modelled": modelled, "because": f"{stated}; {found}", "could_cost": cost, **bound}
 
 
 STAGE = Stage(

@@ -26,6 +26,7 @@ from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
 from pipeline.probes.witness import Witness, witness_of
 from pipeline.run.artifacts import BALANCE, BALLS, CAMERA, ENVIRONMENT, FACTS, HARMONICS, PHOTOGRAPHS, VIEWS, WISHES
 from pipeline.run.errors import CaptureError
+from pipeline.run.evidence import TRIED
 from pipeline.run.stage import Stage
 from pipeline.types import Balance, Camera, Harmonics, Raster, Result, View
 from stages import knobs
@@ -95,7 +96,7 @@ def compute(
     sigma = np.hypot(sh9_sigma(variance), np.abs(coefficients) * shared)
     harmonics = Harmonics(coefficients=coefficients, sigma=sigma, irradiance_factors=COSINE_LOBE)
     outputs = {"balls": observed.balls, "environment": environment, "harmonics": harmonics}
-    evidence = [*observed.evidence, *lamps.evidence, *reasons(applied)]
+    evidence = [*observed.evidence, *lamps.evidence, *reasons(applied, numbers["views"])]
     evidence += [combine.disagreement_reason(differing, len(maps)), filling.reason(filled, gap), near.evidence]
     evidence += [ground_gloss.reason(gloss), resolution.reason(rgb)]
     return Result(outputs, numbers, [*warnings, *lamps.warnings, *near.warnings], evidence)
@@ -168,14 +169,20 @@ def map_numbers(rgb: np.ndarray, seen: np.ndarray) -> dict[str, Any]:
     }
 
 
-def reasons(applied: list[str]) -> list[dict[str, Any]]:
-    """Which terms that are common to all kinds are in, and why."""
+def reasons(applied: list[str], views: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+    """Which terms that are common to all kinds are in, and why; ``views``: figures of `level_views`."""
+    sigma = [one["exposure_ratio_sigma"] / one["exposure_ratio"] for one in views.values()]
     return [
         {
             "term": "relative exposure of views",
             "modelled": bool(applied),
             "because": f"differs by more than {levelling.SIGNIFICANT:.0f} sigma in {', '.join(applied) or 'no view'}",
             "could_cost": "a seam of that ratio",
+            **(
+                {"bound_rel": levelling.SIGNIFICANT * max(sigma, default=0.0), **TRIED}
+                if np.isfinite(sigma).all()
+                else {"no_bound": "they share too few directions to compare"}
+            ),
         },
         {
             "term": "plane from the plate below 7 degrees under the horizon",

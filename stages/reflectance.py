@@ -133,7 +133,7 @@ def compute(
     }
     raster = Raster({**Raster.split(np.clip(albedo, 0.0, HIGHEST)), "seen": share}, ACESCG, {"insitu:unit": "albedo"})
     terms = [
-        texture_evidence(params.model, numbers["detail_kept"]),
+        texture_evidence(params.model, numbers["detail_kept"], measured[known]),
         bounce_evidence(near.estimate if near else None, ignored),
         *([gradient_evidence(fitted)] if fitted else []),
         shadow_evidence(list(ratios), shadow),
@@ -157,13 +157,15 @@ def unhidden(plate: Raster, occluders: list[Occluder]) -> Raster:
     return Raster({**plate.channels, "mask": bits}, plate.space, plate.attributes)
 
 
-def texture_evidence(model: str, kept: float) -> dict[str, Any]:
-    """How the texture was made."""
+def texture_evidence(model: str, kept: float, measured: np.ndarray) -> dict[str, Any]:
+    """How the texture was made, and what one albedo for all of the known texels (N, 3) would get wrong."""
+    spread = float(np.linalg.norm(measured.std(0)) / np.linalg.norm(np.median(measured, 0)))
     return {
         "term": "texture",
         "modelled": model == "textured",
         "because": f"knob reflectance.model = {model}; {kept:.0%} of the texels' own detail is kept, the rest is noise",
-        "could_cost": "wrong reflections of the ground in shiny objects",
+        "could_cost": f"wrong reflections of the ground in shiny objects: {spread:.1%} of its light (one sigma)",
+        "bound_rel": 2 * spread,
     }
 
 
@@ -182,6 +184,7 @@ def shadow_evidence(asked: list[str], found: Found) -> dict[str, Any]:
         "modelled": bool(found.lights),
         "because": because,
         "could_cost": "soft shadows and shadows on fine texture are taken for albedo, which the ratio composite undoes",
+        "no_bound": "an edge that is soft is not told from texture",
     }
 
 
@@ -209,7 +212,7 @@ def bounce_evidence(found: Estimate | None, ignored: float) -> dict[str, Any]:
     term = {"term": "inter-reflection of the local scene"}
     if found is None:
         because = "one convex plane: no point of it sees another, one step of equation 8 is exact"
-        return {**term, "modelled": False, "because": because, "could_cost": "0 for a plane"}
+        return {**term, "modelled": False, "because": because, "could_cost": "nothing for a plane", "bound_rel": 0.0}
     contraction = f"spectral radius of rho F {found.spectral_radius:.2f}"
     if found.method == "gathered":
         because = f"{found.measured_share:.1%} of the bounced light is seen in the plate and gathered; {contraction}"

@@ -23,6 +23,7 @@ from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run import progress
 from pipeline.run.errors import ManifestError
+from pipeline.run.evidence import TRIED
 from pipeline.run.formats import data_window
 from pipeline.run.stage import Stage
 from pipeline.transport.canvas import Canvas
@@ -342,6 +343,8 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "because": f"in the pilot {numbers['light_traced_share']:.1%} of the added light was better found from the "
             f"emitters; worth it from {WORTH_TRACING:.0%}",
             "could_cost": "noise where mirrors and glass throw the light of lamps",
+            "bound_rel": numbers["light_traced_share"],
+            **TRIED,
         },
         {
             "term": "denoiser",
@@ -350,6 +353,7 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "could_cost": "fine detail of reflections; sharpness of caustics"
             if params.denoise
             else f"noise of {numbers.get('object_noise_rel', 0.0):.1%} on objects, a median",
+            "bound_rel": 2 * numbers.get("object_noise_rel", 0.0),
         },
         {
             "term": "path depth",

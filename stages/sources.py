@@ -38,7 +38,7 @@ from stages import knobs
 
 NO_VIEWS = {
     "term": "cloud of further views", "modelled": False, "because": "none are given",
-    "could_cost": "nothing where a board or marker is in the plate; else there is no pose",
+    "could_cost": "nothing where a board or marker is in the plate; else there is no pose", "bound_px": 0.0,
 }  # fmt: skip
 NOT_LOOKED = "surfaces beside the plane are not looked for in a cloud; sources.cloud = always looks"
 
@@ -169,12 +169,14 @@ def told(numbers: dict[str, Any], asked: str) -> dict[str, Any]:
     """The decision as evidence."""
     why, whole = numbers["because"], numbers.get("contact_px") or {}
     left = "; ".join(f"{value:.2f} px at {name}" for name, value in whole.items())
+    bound = {"bound_px": 2 * max(whole.values())} if whole else {"no_bound": "the given pose states no uncertainty"}
     good = f"{numbers.get('route')} and the lens {numbers.get('lens')} leave {left}, budget {numbers['budget_px']:g}"
     if numbers["cloud"]:
         return term(True, "; ".join(why) or f"knob sources.cloud = {asked}, although {good}", "")
     if why:
-        return term(False, f"knob sources.cloud = never, although {'; '.join(why)}", f"that; {NOT_LOOKED}")
-    return term(False, good if whole else "poses and lens are stated", f"{left or 'unknown'} (one sigma); {NOT_LOOKED}")
+        return term(False, f"knob sources.cloud = never, although {'; '.join(why)}", f"that; {NOT_LOOKED}") | bound
+    because = good if whole else "poses and lens are stated"
+    return term(False, because, f"{left or 'unknown'} (one sigma); {NOT_LOOKED}") | bound
 
 
 def term(modelled: bool, because: str, could_cost: str) -> dict[str, Any]:

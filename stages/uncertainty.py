@@ -21,6 +21,7 @@ from pipeline.conventions import ACESCG
 from pipeline.light.alike import shared_sigma_of
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
+from pipeline.run.evidence import not_covered
 from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
@@ -275,22 +276,12 @@ def reasons(followed: list[light.Pattern], left: list[light.Pattern], share: flo
             "because": f"it may change irradiance by {pattern.bound:.2%}"
             + ("" if kept else f"; all that are left out stay below {share:.0%} of the squared bounds"),
             "could_cost": "nothing: it is a mode" if kept else f"{pattern.bound:.2%} of the light on a surface",
+            "bound_rel": pattern.bound,
         }
         for kept, some in ((True, followed), (False, left))
         for pattern in some
     ]
     return rows
-
-
-def not_covered(records: dict[str, Any]) -> list[dict[str, str]]:
-    """What earlier stages did not model and what they say that it could cost: no sigma holds it."""
-    found = []
-    for stage, record in records.items():
-        for row in record.get("evidence") or []:
-            cost = str(row.get("could_cost", ""))
-            if row.get("modelled") is False and cost and not cost.startswith(("nothing", "0 ")):
-                found.append({"stage": stage, "term": str(row["term"]), "could_cost": cost})
-    return found
 
 
 STAGE = Stage(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,40 +12,65 @@ from command import DESK, command
 
 from pipeline.image.metrics import box
 from pipeline.run import artifacts as A
-from pipeline.run import formats, needs
+from pipeline.run import evidence, formats, needs
 from pipeline.run.runner import Build
 from pipeline.run.settings import Settings
 from stages.knobs import KNOBS
 from stages.order import graph
 
 
-@pytest.mark.parametrize(
-    ("text", "bound"),
-    [
-        ("3 % at 70 degrees of incidence on a ball of 0.9, 10 % on chrome; nothing head on", 0.10),
-        ("values there are off by 1.3% (median), 13.1% (95 %)", 0.131),
-        ("of irradiance: 5.2% for walls at 1 m, 2.7% for walls at 2 m", 0.052),
-        ("nothing: its texels are the map's", 0.0),
-        ("0 for a plane", 0.0),
-        ("0.577 px rms over the frame", None),
-        ("a seam of that ratio", None),
-        ("", None),
-    ],
-)
-def test_a_bound_is_the_largest_percentage_in_the_words(text, bound):
-    assert needs.bound_in(text) == (bound if bound is None else pytest.approx(bound))
-
-
-def test_a_stage_may_say_seconds_and_bound_itself():
+def test_a_stage_says_seconds_and_bounds_itself():
     entry = {"term": "gloss", "modelled": False, "because": "no peak", "could_cost": "2 %"}
-    assert needs.told(entry, {}) == entry | {"saved_s": None, "bound_rel": 0.02, "bound_px": None}
-    said = entry | {"saved_rel": 1.5, "bound_rel": 0.03, "bound_px": 0.4}
-    assert needs.told(said, {}, 4.0) == entry | {"saved_s": 6.0, "bound_rel": 0.03, "bound_px": 0.4}
+    unknown = {"saved_s": None, "saved_by": "", "bound_rel": None, "bound_px": None, "bound_deg": None, "no_bound": ""}
+    assert needs.told(entry, {}) == entry | unknown
+    said = entry | {"saved_rel": 1.5, "saved_by": "pixels", "bound_rel": 0.03, "bound_px": 0.4}
+    known = unknown | {"saved_s": 6.0, "saved_by": "pixels", "bound_rel": 0.03, "bound_px": 0.4}
+    assert needs.told(said, {}, 4.0) == entry | known
     assert needs.told(said, {})["saved_s"] is None  # nobody knows what the stage took
-    in_part = entry | {"modelled": "half of it"}
-    assert needs.told(in_part, {})["bound_rel"] == 0.02
+    assert needs.told(entry | {"saved_s": 2.0, "saved_by": "a run"}, {})["saved_s"] == 2.0
+    in_part = entry | {"modelled": "half of it", "no_bound": "no peak"}
+    assert needs.told(in_part, {})["no_bound"] == "no peak"
     modelled = entry | {"modelled": True}
     assert needs.told(modelled, {}) == modelled
+
+
+def test_bounds_are_printed_with_units_or_why_there_are_none():
+    term = {"bound_rel": None, "bound_px": None, "bound_deg": None, "no_bound": "nobody knows"}
+    assert needs.bound_text(term) == "none: nobody knows"
+    assert needs.bound_text(term | {"bound_rel": 0.3, "bound_deg": 1.0}) == "30.00%, 1.00 degrees"
+
+
+def test_a_row_that_is_silent_about_its_cost_is_found():
+    row = {"term": "gloss", "modelled": False, "could_cost": "2 %"}
+    assert evidence.silent([row, row | {"modelled": "half"}]) == ["gloss", "gloss"]
+    assert evidence.silent([row | {"bound_px": float("nan")}]) == ["gloss"]
+    assert not evidence.silent([row | {"modelled": True}, row | {"bound_deg": 0.0}, row | {"no_bound": "unknown"}])
+
+
+def test_what_no_sigma_covers_is_what_costs_something():
+    rows = [
+        {"term": "gloss", "modelled": False, "could_cost": "2 %", "bound_rel": 0.02},
+        {"term": "dirt", "modelled": False, "could_cost": "its light", "no_bound": "unknown"},
+        {"term": "gaps", "modelled": False, "could_cost": "nothing", "bound_rel": 0.0},
+        {"term": "plane", "modelled": True, "could_cost": "contact"},
+    ]
+    found = evidence.not_covered({"probe": {"evidence": rows}, "sfm": {}})
+    assert [row["term"] for row in found] == ["gloss", "dirt"]
+    assert found[0] == {"stage": "probe", "term": "gloss", "could_cost": "2 %"}
+
+
+def rows_of(out: Path) -> list[dict[str, Any]]:
+    """Evidence of all stages of a build."""
+    records = [json.loads(path.read_text()) for path in sorted(out.glob("*/record.json"))]
+    return [row for record in records for row in record.get("evidence") or []]
+
+
+HARD = [pytest.param(name, marks=pytest.mark.slow) for name in ("counter", "courtyard", "lacquer", "cellar", "corner")]
+
+
+@pytest.mark.parametrize("capture", ["desk", *HARD])
+def test_every_row_says_what_it_could_cost_in_numbers_or_why_not(capture, request):
+    assert evidence.silent(rows_of(request.getfixturevalue(f"{capture}_build"))) == []
 
 
 def test_seconds_come_from_the_trade_where_the_entry_names_the_knob(tmp_path):
@@ -65,11 +91,11 @@ def test_seconds_come_from_the_trade_where_the_entry_names_the_knob(tmp_path):
 
 def test_sums_are_over_what_is_known():
     terms = [
-        {"term": "a", "modelled": False, "saved_s": 2.0, "bound_rel": 0.03, "bound_px": None},
-        {"term": "b", "modelled": "in part", "saved_s": None, "bound_rel": 0.04, "bound_px": None},
-        {"term": "c", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": None},
+        {"term": "a", "modelled": False, "saved_s": 2.0, "bound_rel": 0.03, "bound_px": None, "bound_deg": 1.0},
+        {"term": "b", "modelled": "in part", "saved_s": None, "bound_rel": 0.04, "bound_px": None, "bound_deg": None},
+        {"term": "c", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": None, "bound_deg": None},
         {"term": "d", "modelled": True},
-        {"term": "e", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": 0.5},
+        {"term": "e", "modelled": False, "saved_s": None, "bound_rel": None, "bound_px": 0.5, "bound_deg": None},
     ]
     found = needs.left_out([{"terms": terms[:2]}, {"terms": terms[2:]}])
     assert found == {
@@ -79,7 +105,7 @@ def test_sums_are_over_what_is_known():
     line = needs.summed(found)
     assert "7.0% if all" in line
     assert "5.0% if" in line
-    assert "of 4 terms 1 only move things, 1 name no figure" in line
+    assert "of 4 terms 1 only move things, 1 say why they have no figure" in line
     assert "2.0 CPU s saved by 1" in line
 
 

@@ -67,7 +67,8 @@ def exif_camera(frame: Frame, lens_name: str = "") -> tuple[Camera, dict[str, An
         {"term": "focal length", "modelled": True, "because": because,
          "could_cost": f"{sigma:.0%} of distances by rule; more where it was focused nearer than 20 focal lengths"},
         {"term": "distortion", "modelled": bool(bend[1:].any()), "because": said,
-         "could_cost": f"{corner * np.hypot(frame.width, frame.height) / 2:.1f} px at the corners, by rule"},
+         "could_cost": f"{corner * np.hypot(frame.width, frame.height) / 2:.1f} px at the corners, by rule",
+         "bound_px": float(corner * np.hypot(frame.width, frame.height))},
     ]  # fmt: skip
     return camera, numbers, warnings, evidence
 

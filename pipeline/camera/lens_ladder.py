@@ -10,6 +10,7 @@ families apart that differ over the frame, that is said.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from pipeline.camera.opencv_bridge import first_calibration
 from pipeline.camera.resection import minimise, planar_candidates, refine, residuals_and_jacobian, robust_scale
 from pipeline.camera.residual_pattern import pattern
 from pipeline.run.errors import CaptureError, NumericalError
+from pipeline.run.evidence import TRIED
 from pipeline.types import Camera
 
 LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("p1", "p2"), ("k3",), ("k4", "k5", "k6"))
@@ -98,7 +100,7 @@ def best_lens(photos: Photos, size: tuple[int, int], warnings: list[str]) -> tup
     best, table, doubt = contest(entrants)
     left_out = next((notes for lens, notes in wide if lens is best), said)
     errors = {key: value for one in entrants for key, value in one.errors.items()}
-    row = wide_row(best, f"{why}; held-out error " + ", ".join(table))
+    row = wide_row(best, f"{why}; held-out error " + ", ".join(table), [lens for lens, _ in wide])
     return replace(best, errors=errors, evidence=[*best.evidence, row]), [*warnings, *left_out, *doubt]
 
 
@@ -151,11 +153,15 @@ def undecided(entrants: list[Climbed], held: list[np.ndarray], best: int, corner
     return []
 
 
-def wide_row(best: Climbed, because: str) -> dict[str, Any]:
-    """Evidence for or against a wide lens."""
+def wide_row(best: Climbed, because: str, others: Sequence[Climbed] = ()) -> dict[str, Any]:
+    """Evidence for or against a wide lens; ``others``: the wide ones that were fitted."""
     taken = model_of(best.fit.camera.distortion) != "brown"
-    cost = "" if taken else "nothing that held-out photographs show"
-    return {"term": "lens fisheye or rational", "modelled": taken, "because": because, "could_cost": cost}
+    row = {"term": "lens fisheye or rational", "modelled": taken, "because": because, "could_cost": ""}
+    if taken:
+        return row
+    apart = [disagreement(best.fit.camera, one.fit.camera) for one in others]
+    cost = bound_of(min(apart)) if apart else {"no_bound": "none fits these photographs"}
+    return row | {"could_cost": "nothing that held-out photographs show", **cost, **TRIED}
 
 
 def asks_for_wide(found: Climbed, offered: int) -> str:
@@ -340,8 +346,15 @@ def cost_of(
     try:
         shift = disagreement(chosen.camera, fit_model(start, poses, photos, terms + step).camera)
     except NumericalError:
-        return {"could_cost": "unknown: these photographs do not determine it"}
-    return {"could_cost": f"{shift:.3f} px rms over the frame", "bound_px": float(shift)}
+        return {"could_cost": "unknown", "no_bound": "these photographs do not determine it", **TRIED}
+    return {"could_cost": f"{shift:.3f} px rms over the frame", **bound_of(shift), **TRIED}
+
+
+def bound_of(shift_px: float) -> dict[str, Any]:
+    """What evidence says of a lens that is so far from another, rms over the frame; infinite where one of them ends."""
+    return (
+        {"bound_px": float(shift_px)} if np.isfinite(shift_px) else {"no_bound": "one of the lenses ends in the frame"}
+    )
 
 
 def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:

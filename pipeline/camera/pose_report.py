@@ -77,5 +77,11 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: 
     cost = "" if known else "pose covariances are too small by the unknown error of the intrinsics"
     return [
         *entries,
-        {"term": "intrinsics in the pose covariance", "modelled": known, "because": because, "could_cost": cost},
+        {
+            "term": "intrinsics in the pose covariance",
+            "modelled": known,
+            "because": because,
+            "could_cost": cost,
+            **({} if known else {"no_bound": "nobody says how sure the given camera is"}),
+        },
     ]

@@ -16,10 +16,12 @@ from pipeline.camera.adjustment import free_columns, lens_vector, with_lens
 from pipeline.camera.bundle import Adjusted, adjust
 from pipeline.camera.exif_camera import equivalent_focal_px
 from pipeline.camera.lens import pixel_rays
+from pipeline.camera.lens_ladder import bound_of, disagreement
 from pipeline.camera.reprojection import Bundle, Corners
 from pipeline.camera.rigid import umeyama
 from pipeline.conventions import transform_points
 from pipeline.run.errors import NumericalError
+from pipeline.run.evidence import TRIED
 from pipeline.types import Camera, Frame, Reconstruction
 
 USUAL_FOCAL = 1.2  # of the long side, without any hint
@@ -115,10 +117,12 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
         richer = fit(terms + step, richest.bundle, richest)
         gain = best.deviance - richer.deviance
         taken = bool(gain > NEEDED_DEVIANCE * len(step))
+        apart = disagreement(best.bundle.cameras[body], richer.bundle.cameras[body])
         evidence.append({
             "term": f"lens {' '.join(step)}", "modelled": taken,
             "because": f"deviance of the tracks falls by {gain:.0f} (needs {NEEDED_DEVIANCE * len(step):g})",
-            "could_cost": "" if taken else "within the stated uncertainty of the lens",
+            "could_cost": "" if taken else f"{apart:.3f} px rms over the frame",
+            **({} if taken else TRIED | bound_of(apart)),
         })  # fmt: skip
         if taken:
             best, terms = richer, terms + step

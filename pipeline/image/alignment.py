@@ -58,7 +58,14 @@ def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed
             _refuse(shift, f"{names[before]}, {names[after]}", frames[after].mosaic.shape[1])
     known = [shift for shift in shifts if shift is not None]
     if not known:
-        return list(frames), None, _evidence(False, "no structure to measure a shift by", "blur")
+        return (
+            list(frames),
+            None,
+            {
+                **_evidence(False, "no structure to measure a shift by", "blur"),
+                "no_bound": "frames without structure show no shift; nor would its blur show",
+            },
+        )
     sigma = max(shift.sigma for shift in known)
     largest = float(np.hypot(*places.T).max())
     said = f"largest shift {largest:.3f} +- {sigma:.3f} px, quadrants within {max(s.quadrants for s in known):.2f} px"

@@ -165,4 +165,7 @@ def _evidence(facts: dict[str, Any], fitted: chart.Fit, kept: chart.Fit | None, 
     if not wanted:
         because += '; [chart] fit = "matrix" takes it'
     cost = "colours unlike those of the patches" if wanted else "the difference of the two, in saturated colours"
-    return {"term": "colour matrix from the chart", "modelled": wanted, "because": because, "could_cost": cost}
+    return {
+        "term": "colour matrix from the chart", "modelled": wanted, "because": because, "could_cost": cost,
+        "no_bound": "a difference of colour, delta E, is no share of light",
+    }  # fmt: skip

@@ -243,4 +243,5 @@ def _report(result: Linearised, camera: str, response: Response, frames: list[Fr
         "modelled": known,
         "because": f"{response.blocks} flat blocks seen in several frames, noise {response.misfit:.2f} codes",
         "could_cost": f"{sigma:.1%} of radiance, in the variance; local tone mapping and saturation are not modelled",
+        "bound_rel": 2 * sigma,
     })  # fmt: skip

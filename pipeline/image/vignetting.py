@@ -28,6 +28,7 @@ POWERS = (2, 4, 6)
 ROBUST = 5.0
 MODEL_SIGMA = 0.001  # relative, at the corner: what three terms leave of a lens whose rim is in the way
 TABLE = 2049  # radii of a tabulated gain
+HALF_FRAME_MM = np.hypot(36, 24) / 2  # diagonal of a 35 mm frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,28 +222,39 @@ class Losses:
         """One row for all views that share a source."""
         by_source: dict[str, list[str]] = {}
         corner: dict[str, float] = {}
+        short: list[float] = []  # focal lengths, 35 mm, of views that stay as they are; 0: unknown
         for view in views:
             found = self._found(profiles[view], shapes[view])
             source = found[2] if found else ""
             by_source.setdefault(source, []).append(view)
             if found:
                 corner[source] = max(corner.get(source, 1.0), float(found[0].max()))
+            else:
+                short.append(float((profiles[view].get("optics") or {}).get("focal_35mm") or 0))
         if self.fitted is not None and (left := by_source.get("", [])):
             self.warnings.append(
                 f"{', '.join(left)}: not of the camera, focal length and aperture of the flat photographs; their "
                 "corners stay dark"
             )
-        return [_evidence(source, names, corner.get(source, 1.0), self.facts) for source, names in by_source.items()]
+        shortest = min(short, default=0.0)
+        return [
+            _evidence(source, names, corner.get(source, 1.0), self.facts, shortest)
+            for source, names in by_source.items()
+        ]
 
 
-def _evidence(source: str, views: list[str], corner: float, facts: dict[str, Any]) -> dict[str, Any]:
+def _evidence(source: str, views: list[str], corner: float, facts: dict[str, Any], shortest: float) -> dict[str, Any]:
+    """A row; ``shortest``: focal length of views without a source, in 35 mm terms, 0 where one is not known."""
     which = ", ".join(views)
     if not source:
         because = (
             "not wanted" if facts.get("vignetting") == "none" else "no flat photographs, and no lens that is known"
         )
         cost = "radiance low by about the cosine to the fourth of the field angle at the corners"
-        return {"term": "vignetting", "modelled": False, "because": f"{which}: {because}", "could_cost": cost}
+        row = {"term": "vignetting", "modelled": False, "because": f"{which}: {because}", "could_cost": cost}
+        if not shortest:
+            return row | {"no_bound": "no metadata state the field of view"}
+        return row | {"bound_rel": 1 - (1 + (HALF_FRAME_MM / shortest) ** 2) ** -2}
     cost = "what is stated in the variance" if source.startswith("flat") else "no uncertainty is stated with it"
     because = f"{which}: {source}, {corner:.2f} times at the corners"
     return {"term": "vignetting", "modelled": True, "because": because, "could_cost": cost}

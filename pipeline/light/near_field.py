@@ -241,5 +241,5 @@ def places(valid: np.ndarray, measured: np.ndarray) -> dict[str, str]:
 def _reason(modelled: bool, because: str, cost: str, bound: float | None) -> dict[str, Any]:
     return {
         "term": "near field: the map at the objects", "modelled": modelled, "because": because, "could_cost": cost,
-        "bound_rel": bound,
+        **({"no_bound": "objects lie beyond known or assumed walls"} if bound is None else {"bound_rel": bound}),
     }  # fmt: skip

@@ -16,6 +16,7 @@ from pipeline.probes.finding import Found
 from pipeline.probes.glass import Glass
 from pipeline.probes.observation import Shots, ViewMap
 from pipeline.run.errors import NumericalError
+from pipeline.run.evidence import TRIED
 from pipeline.transport.conductors import preset
 from pipeline.types import Raster
 
@@ -148,9 +149,11 @@ def dent_reason(dented: dict[str, Dents], sigma: float, seen: list[float]) -> di
         )
     if seen:
         said += f"; two views leave {np.degrees(min(seen)):.1f} degrees to dents and parallax together"
+    off = [one.direction_rms_rad for one in dented.values()] or seen
     return {
         "term": "dents of the ball", "modelled": sigma > 0, "because": said,
         "could_cost": "directions off by twice the surface's tilt; the light's energy hardly",
+        **({"bound_deg": float(np.degrees(max(off))), **TRIED} if off else {"no_bound": said}),
     }  # fmt: skip
 
 
@@ -250,6 +253,7 @@ def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = F
         "modelled": surface.tint is not None or surface.glass is not None,
         "because": "too little of the plane is seen in the ball to test it",
         "could_cost": "3 % at 70 degrees of incidence on a ball of 0.9, 10 % on chrome; nothing head on",
+        "bound_rel": 0.1,
     }
     if measured is None:
         return [
@@ -257,6 +261,11 @@ def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = F
                 "term": "reflectance measured from the plane", "modelled": False,
                 "because": "fewer blocks of the plane than needed are seen both directly and in the ball",
                 "could_cost": "the light is off by what the stated reflectance is off",
+                **(
+                    {"bound_rel": 2 * float(np.max(surface.sigma))}
+                    if surface.source == "given"
+                    else {"no_bound": "nobody states how the ball reflects, and nothing measures it"}
+                ),
             },
             angle,
         ]  # fmt: skip
@@ -265,6 +274,7 @@ def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = F
         for row in measured.tests
     ]
     angle["because"] = "; ".join(said)
+    off = np.abs(surface.facing - measured.facing) + 2 * measured.sigma
     return [
         {
             "term": "reflectance measured from the plane", "modelled": surface.source == "measured",
@@ -275,8 +285,10 @@ def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = F
                 + f"used is what is {surface.source}"
             ),
             "could_cost": "the light is off by what the stated reflectance is off",
+            "bound_rel": float(np.max(off / measured.facing)),
+            **TRIED,
         },
-        angle,
+        angle | TRIED,
     ]  # fmt: skip
 
 
@@ -287,4 +299,5 @@ def dirt_reason(dirty: dict[str, np.ndarray], tested: int, measured: Measured | 
         "term": "dirt on the ball", "modelled": bool(dirty),
         "because": f"{tested} comparisons with {two} show " + (f"spots in {', '.join(dirty)}" if dirty else "no spot"),
         "could_cost": "the light behind a spot, as much as the spot swallows",
+        "no_bound": "spots where nothing was compared are not known", **(TRIED if tested else {}),
     }  # fmt: skip

@@ -47,7 +47,7 @@ WEAK = 0.5  # relative sigma of a flux from which on the bound says as much
 
 NOTHING = {
     "term": "flux of clipped lamps", "modelled": False, "because": "nothing is clipped in every frame",
-    "could_cost": "nothing",
+    "could_cost": "nothing", "bound_rel": 0.0,
 }  # fmt: skip
 
 
@@ -234,6 +234,7 @@ def _reason(number: int, row: dict[str, Any]) -> dict[str, Any]:
     return {
         "term": f"flux of clipped lamp {number}, {_named(row)}", "modelled": not row["lower_bound"],
         "because": because, "could_cost": cost,
+        **({"no_bound": "no photograph says how bright it was"} if row["lower_bound"] else {}),
     }  # fmt: skip
 
 

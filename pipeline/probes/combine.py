@@ -187,6 +187,7 @@ def disagreement_reason(figures: dict[str, float], views: int) -> dict[str, Any]
         else "one view only: nothing to compare",
         "could_cost": "variance too small by up to "
         f"{figures['disagreement_worst'] ** 2:.0f} times where near things, clouds or people moved",
+        **({"bound_rel": 0.0} if views > 1 else {"no_bound": "one view only: nothing to compare"}),
     }
 
 

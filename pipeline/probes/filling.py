@@ -223,5 +223,6 @@ def reason(figures: dict[str, float | int], error: Prior | None) -> dict[str, An
         chance = f"; {error.lamps} further trials uncovered a lamp" if error.lamps else ""
         cost = f"{figures['filled_light_sigma_rel']:.2%} of the light (1 sigma), a lamp hidden there apart{chance}"
     return {
-        "term": "smooth prior where nobody saw", "modelled": error is not None, "because": because, "could_cost": cost
+        "term": "smooth prior where nobody saw", "modelled": error is not None, "because": because, "could_cost": cost,
+        "bound_rel": 2 * float(figures["filled_light_sigma_rel"]),
     }  # fmt: skip

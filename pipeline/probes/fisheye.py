@@ -173,5 +173,7 @@ def reasons(turns: dict[str, Orientation]) -> list[dict[str, Any]]:
             "modelled": False,
             "because": "the manifest gives the formula alone",
             "could_cost": "10 to 30 % towards the rim of a lens at full aperture; a degree of direction",
+            "bound_rel": 0.3,
+            "bound_deg": 1.0,
         },
     ]

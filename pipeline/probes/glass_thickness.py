@@ -25,6 +25,7 @@ from pipeline.probes.plane_image import (
     SMOOTH_PX,
 )
 from pipeline.probes.sphere_fit import SphereFit
+from pipeline.run.evidence import TRIED
 from pipeline.types import Camera, Raster, View
 
 TYPICAL = 0.03  # of the radius: blown gazing balls have 1 to 3 mm of 50 to 150
@@ -186,7 +187,10 @@ def judge(
         "thickness": shown.thickness,
     }
     unsure = 0.0 if glass is None else direction_sigma(glass, error)
-    row = {"term": "glass before the ball's mirror", "modelled": glass is not None, "because": said, "could_cost": cost}
+    row = {
+        "term": "glass before the ball's mirror", "modelled": glass is not None, "because": said, "could_cost": cost,
+        "bound_deg": float(rms), **(TRIED if usable else {}),
+    }  # fmt: skip
     return GlassEvidence(glass, unsure, {"glass": numbers}, warnings, [row])
 
 

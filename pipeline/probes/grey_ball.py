@@ -202,11 +202,13 @@ def reasons() -> list[dict[str, Any]]:
             "modelled": False,
             "because": "a diffuse ball does not show band 3 at all and band 4 at a sixth of band 2",
             "could_cost": "hard shadows and highlights; irradiance to 1 %, at a single lamp to 9 % of its peak",
+            "bound_rel": 0.09,
         },
         {
             "term": "the ball's own shadow on the plane",
             "modelled": False,
             "because": f"normals lower than y = {LOWEST} are left out; others see little of the ground near the foot",
             "could_cost": "light from below too dark by a few percent of the light",
+            "no_bound": "how dark the ground is about the foot was not measured",
         },
     ]

@@ -169,4 +169,5 @@ def reason(gloss: Gloss) -> dict[str, Any]:
         "term": "mirror images in the ground, from the plate to the probe", "modelled": gloss.taken, "because": said,
         "could_cost": f"a lobe that is off by {LOBE_SIGMA:.0%}, which the variance has" if gloss.taken
         else "nothing on a matt ground; the light from below by what a gloss too faint to be found mirrors",
+        "no_bound": "held-out cells do not tell it from none; the reflectance stage bounds what the plate shows of it",
     }  # fmt: skip

@@ -229,4 +229,5 @@ def _reason(route: str, sigma: float, modelled: bool) -> dict[str, Any]:
         "modelled": modelled,
         "because": because[route],
         "could_cost": f"{sigma:.1%} of all light at once; it does not average over texels",
+        "bound_rel": 2 * sigma,
     }

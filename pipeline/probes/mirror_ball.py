@@ -361,6 +361,7 @@ def centred(anchors: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "modelled": any(one["used"] for one in anchors.values()),
         "because": "; ".join(said),
         "could_cost": "up to a pixel of drift of the rim alone: 1.3 degrees for a ball of 100 px",
+        "bound_px": 1.0,
     }
 
 
@@ -386,5 +387,6 @@ def reasons(found: dict[str, Found]) -> list[dict[str, Any]]:
             "modelled": False,
             "because": "the room's distances are not measured",
             "could_cost": "directions off by R over distance, radiance unbiased",
+            "no_bound": "how far off they are is not known; what the objects feel of it is the near field's row",
         },
     ]

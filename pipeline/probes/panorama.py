@@ -99,5 +99,6 @@ def reasons(shots: Shots, found: orientation.Orientation) -> list[dict[str, Any]
             "modelled": half > 0,
             "because": f"probe.nadir_deg = {half:g}: tripod, hand or a painted patch is there",
             "could_cost": "without it, a stitcher's patch as light from below",
+            "no_bound": "nothing tells what was painted there",
         },
     ]

@@ -98,6 +98,7 @@ def reason(figures: dict[str, dict[str, Any]], views: int) -> dict[str, Any]:
         "modelled": any(z > SUSPICIOUS for z in measured.values()),
         "because": because,
         "could_cost": "one person's solid angle of wrong light",
+        "no_bound": "how bright he was against what he hid is not known",
     }
 
 

@@ -157,4 +157,5 @@ def parallax(probe: dict[str, Any]) -> dict[str, Any]:
         "because": "probe.position_m is stated and the light is taken as distant" if here
         else "probe.position_m is not stated: the map is taken as that at the objects",
         "could_cost": "directions off by the distance moved over the distance of what is seen; near lamps by more",
+        "no_bound": "how far off walls and lamps are is not known",
     }  # fmt: skip

@@ -1,10 +1,7 @@
 """What a build modelled, what it did not, on what evidence, what that could cost, and the seconds: from its records.
 
-An entry of a stage's evidence may say ``saved_rel``, what leaving the term out saved over what the stage took (from
-counts, not clocks: records hold no timings), and ``bound_rel``, the most that it could cost (share), or ``bound_px``,
-for what moves and does not change in brightness. Else seconds come from `insitu trade` of the same build, where the
-entry names the knob, and bounds from the words of ``could_cost``: the largest percentage that they name outside
-brackets.
+Bounds are those that each row of evidence states (`pipeline.run.evidence`). Seconds come from `insitu trade` of the
+same build, where the row names the knob, else from what the row says of them.
 """
 
 from __future__ import annotations
@@ -17,12 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.run.errors import ArtifactError
+from pipeline.run.evidence import BOUNDS, is_open
 from pipeline.run.runner import Build, is_complete
 
 NAMED = re.compile(r"\bknob ([a-z]+\.[a-z_]+)")
-ASIDE = re.compile(r"\([^)]*\)")
-PERCENT = re.compile(r"(\d+(?:\.\d+)?) ?%")
-NOTHING = re.compile(r"(nothing\b|0 )")  # how a text begins that says so
 MARKS = {True: "+", False: "-"}  # anything else that `modelled` says is a part: "~"
 
 
@@ -31,8 +26,9 @@ def needs(build: Build) -> dict[str, Any]:
 
     ``stages``: [{stage, seconds, cpu_seconds, stale, terms: [{term, modelled, because, could_cost}]}]; ``stale`` is
     empty, or says why the record no longer holds. A term that was not modelled, or in part, also has ``saved_s``
-    [CPU s], ``bound_rel`` and ``bound_px``, each None where unknown. ``left_out``: how many those are, and over those
-    that are known the sum of the seconds, and of the bounds (and of their squares, rooted).
+    [CPU s] and ``saved_by``, how that is known; ``bound_rel``, ``bound_px`` and ``bound_deg``, each None where it is
+    not stated, and ``no_bound``, why. ``left_out``: how many those are, and over those that are known the sum of the
+    seconds, and of the bounds (and of their squares, rooted).
 
     Raises ArtifactError when a stage has not run.
     """
@@ -59,26 +55,24 @@ def needs(build: Build) -> dict[str, Any]:
 
 
 def told(entry: dict[str, Any], bought: dict[str, float], cpu_seconds: float | None = None) -> dict[str, Any]:
-    """An entry of evidence, and of what was not wholly modelled the seconds saved and the bound, None where unknown.
+    """An entry of evidence, and of what was not wholly modelled the seconds saved and the bounds, None where unknown.
 
     ``cpu_seconds``: of its stage.
     """
     term = {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
-    if entry.get("modelled") is True:
+    if not is_open(entry):
         return term
     knob = NAMED.search(str(term["because"]))
-    saved = bought.get(knob[1]) if knob else None
+    saved, by = (bought.get(knob[1]) if knob else None), "this build's trade"
+    if saved is None:
+        saved, by = entry.get("saved_s"), entry.get("saved_by", "")
     if saved is None and cpu_seconds is not None and "saved_rel" in entry:
         saved = cpu_seconds * entry["saved_rel"]
-    bound = entry.get("bound_rel", bound_in(str(term["could_cost"])))
-    return {**term, "saved_s": saved, "bound_rel": bound, "bound_px": entry.get("bound_px")}
-
-
-def bound_in(text: str) -> float | None:
-    """The largest percentage that a text names, as a share; 0 where it begins with nothing; None without either."""
-    if found := PERCENT.findall(ASIDE.sub("", text)):
-        return max(map(float, found)) / 100
-    return 0.0 if NOTHING.match(text) else None
+    bounds = {name: entry.get(name) for name in BOUNDS}
+    return {
+        **term, "saved_s": saved, "saved_by": "" if saved is None else by, **bounds,
+        "no_bound": entry.get("no_bound", ""),
+    }  # fmt: skip
 
 
 def bought_by_knobs(build: Build) -> dict[str, float]:
@@ -100,7 +94,8 @@ def left_out(stages: list[dict[str, Any]]) -> dict[str, Any]:
     """Sums over what was not modelled, or in part; how many of the terms tell nothing."""
     terms = [term for stage in stages for term in stage["terms"] if term["modelled"] is not True]
     bounds = [term["bound_rel"] for term in terms if term["bound_rel"] is not None]
-    moved = [term for term in terms if term["bound_rel"] is None and term["bound_px"] is not None]
+    moves = [term for term in terms if term["bound_rel"] is None]
+    moved = [term for term in moves if term["bound_px"] is not None or term["bound_deg"] is not None]
     saved = [term["saved_s"] for term in terms if term["saved_s"] is not None]
     return {
         "terms": len(terms), "bounded": len(bounds), "moved": len(moved), "bound_rel_sum": math.fsum(bounds),
@@ -147,10 +142,9 @@ def as_text(found: dict[str, Any], build: Build) -> str:
                 lines += wrapped("how far", term["modelled"])
             lines += wrapped("because", term["because"]) + wrapped("could cost", term["could_cost"])
             if "saved_s" in term:
-                saved, bound, px = term["saved_s"], term["bound_rel"], term["bound_px"]
-                lines += wrapped("saved", "-" if saved is None else f"{saved:.1f} CPU s")
-                shift = "-" if px is None else f"{px:.3f} px"
-                lines += wrapped("bound", shift if bound is None else f"{bound:.2%}")
+                saved, by = term["saved_s"], f" ({term['saved_by']})" if term["saved_by"] else ""
+                lines += wrapped("saved", "-" if saved is None else f"{saved:.1f} CPU s{by}")
+                lines += wrapped("bound", bound_text(term))
     terms = [term for stage in found["stages"] for term in stage["terms"]]
     counts = [sum(term["modelled"] is state for term in terms) for state in (True, False)]
     lines += ["", f"modelled {counts[0]}, not {counts[1]}, in part {len(terms) - sum(counts)}"]
@@ -160,13 +154,20 @@ def as_text(found: dict[str, Any], build: Build) -> str:
     return "\n".join(lines)
 
 
+def bound_text(term: dict[str, Any]) -> str:
+    """The bounds of a term with their units, or why it has none."""
+    words = {"bound_rel": "{:.2%}", "bound_px": "{:.3f} px", "bound_deg": "{:.2f} degrees"}
+    known = [words[name].format(term[name]) for name in BOUNDS if term[name] is not None]
+    return ", ".join(known) or f"none: {term['no_bound']}"
+
+
 def summed(left: dict[str, Any]) -> str:
     """One line on what was not modelled, all together."""
     silent = left["terms"] - left["bounded"] - left["moved"]
     line = (
         f"not modelled, or in part, could cost {left['bound_rel_sum']:.1%} if all bounds were met at once, "
         f"{left['bound_rel_root']:.1%} if they were independent; of {left['terms']} terms "
-        f"{left['moved']} only move things, {silent} name no figure"
+        f"{left['moved']} only move things, {silent} say why they have no figure"
     )
     return line + (f"; {left['saved_s']:.1f} CPU s saved by {left['timed']} of them" if left["timed"] else "")
 

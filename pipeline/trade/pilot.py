@@ -19,6 +19,7 @@ import numpy as np
 from pipeline.image import metrics
 from pipeline.light.environment import total_energy
 from pipeline.run.artifacts import CAMERA, EMITTERS, HARMONICS, PHOTOGRAPHS
+from pipeline.run.evidence import not_covered
 from pipeline.run.runner import Build
 from pipeline.trade.model import Setting
 from pipeline.types import Camera, Emitter, Occluder, Raster
@@ -199,7 +200,7 @@ class Pilot:
             "lamps": self._by_lamps(),
             "flux_sigma": flux_sigma(self.build),
             "stated": stated(self.build),
-            "bounds": bounds(records),
+            "bounds": not_covered(records),
         }
         last = self.record["renders"][-1]
         last["cpu_seconds"] = min(last["cpu_seconds"], self.warm_seconds)
@@ -322,13 +323,3 @@ def noise_of(plate: Raster) -> float:
     rgb, variance = plate.rgb()[::4, ::4], plate.rgb("variance")[::4, ::4]
     known = np.isfinite(variance).all(-1) & (rgb > 0).all(-1)
     return float(np.median(np.sqrt(variance[known]).mean(-1) / rgb[known].mean(-1))) if known.any() else 0.0
-
-
-def bounds(records: dict[str, dict[str, Any]]) -> list[dict[str, str]]:
-    """What earlier stages left out and can only bound: {stage, term, could_cost}. None of it is in a prediction."""
-    return [
-        {"stage": name, "term": entry["term"], "could_cost": str(entry["could_cost"])}
-        for name, record in records.items()
-        for entry in record.get("evidence") or []
-        if entry.get("modelled") is False and entry.get("could_cost") not in ("", None, "nothing")
-    ]

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.run.evidence import TRIED
 from pipeline.transport.patches import Lights, lights_of, upper
 from pipeline.transport.reflectance import linear
 from pipeline.types import Surface
@@ -345,5 +346,5 @@ def explain(surface: Surface) -> dict[str, Any]:
         "modelled": modelled,
         "because": f"held-out log-likelihood: {scores}" if scores else surface.scores[0]["because"],
         "could_cost": cost,
-        "bound_rel": wrong,
+        **({"no_bound": "no gloss was tried"} if wrong is None else {"bound_rel": wrong, **TRIED}),
     }
