@@ -123,7 +123,7 @@ def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     plate = reduce_truth(bundled, folder / "truth", studio.shape, factor_of(whole), whole.camera.blur_sigma_px)
     record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, {})
     capture.write_truth(folder / "truth" / "truth.json", record)
-    balls = {view.name: simulate.ball_picture(studio, view, say) for view in scene.ball_view}
+    balls = {view.name: simulate.ball_picture(studio, view) for view in scene.ball_view}
     measure, sigma = studio.radiance(), scene.camera.blur_sigma_px
     boards = []
     for number, photo in enumerate(scene.calibration):

@@ -39,7 +39,7 @@ from pipeline.simulation.photograph import (
     surface_albedo,
     trace,
 )
-from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, ViewFacts, load_scene
+from pipeline.simulation.scene_file import BoardPhoto, SimulatedScene, Span, ViewFacts, load_scene
 from pipeline.simulation.spectral import Size, main, twin
 from pipeline.simulation.thrown import seen_on_table, thrown_irradiance
 from pipeline.simulation.world import Place
@@ -111,7 +111,7 @@ def simulate(scene_toml: Path, out: Path, progress: Callable[[str], None]) -> No
     views = {view.name: studio.pose(view) for view in [scene.plate, *scene.ball_view, *scene.view]}
     take_calibration(studio, shoot, progress)
     take_views(studio, shoot, progress)
-    pictures = {view.name: ball_picture(studio, view, progress) for view in scene.ball_view}
+    pictures = ball_pictures(studio, progress)
     pictures["plate"], noise = plate_truth(studio, out, progress)
     pictures |= turned_plates(studio, progress)
     capture.take_brackets(shoot, pictures)
@@ -156,19 +156,18 @@ def take_views(studio: Studio, shoot: capture.Shoot, progress: Callable[[str], N
         write_bytes(shoot.out / "views" / f"{view.name}.jpg", data)
 
 
-def ball_picture(studio: Studio, view: ViewFacts, progress: Callable[[str], None]) -> np.ndarray:
-    """(H, W, 3) radiance of a ball view, through the lens.
+def ball_picture(studio: Studio, view: ViewFacts, frame: int | None = None) -> np.ndarray:
+    """(H, W, 3) radiance of a ball view, through the lens; of that frame of its bracket which a hand turned.
 
     Light that the ball throws onto the table is hard to sample: it would speckle the picture. It is smooth, since the
     ball is convex, so it is found as the difference from a black ball under the same random numbers and smoothed, as
     irradiance on each surface and as radiance in the ball; its energy is kept. What it throws of small lamps themselves
     is traced from them (`pipeline.simulation.thrown`), and samples that meet one by way of the ball are left out here.
     """
-    progress(f"{view.name}: mirror ball")
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
-    pose = studio.pose(view)
-    people = place.photographer(pose)
-    seed = 100_000 * (2 + [v.name for v in scene.ball_view].index(view.name))
+    people = place.photographer(studio.pose(view))
+    pose = turned(studio.pose(view), (0.0, 0.0) if frame is None else scene.bracket.ball_turn_deg[frame])
+    seed = 100_000 * (2 + scene.ball_view.index(view)) + (0 if frame is None else 10_000 * (frame + 1))
     small = [lamp for lamp in scene.light.lamp if lamp.diameter_deg < SMALL_DEG]
     lamps = min((scene.light.scale * max(lamp.radiance) for lamp in small), default=np.inf)
     some = max(16, sampling.ball // 4) if small else sampling.ball  # what is smoothed needs fewer
@@ -253,19 +252,37 @@ def plate_truth(studio: Studio, out: Path, progress: Callable[[str], None]) -> t
     return studio.glared(pictures["plate"]), found | spent | finer
 
 
+def turned(pose: np.ndarray, turn: Span) -> np.ndarray:
+    """world_from_camera after a turn about the camera's own centre, by degrees to the right and upwards."""
+    right, up = np.tan(np.radians(turn))
+    return aim(pose, (-float(right), float(up)))  # where the old axis is seen
+
+
 def turned_plates(studio: Studio, progress: Callable[[str], None]) -> dict[str, np.ndarray]:
     """Plate frames (H, W, 3), "plate_0" and so on, of a hand that turned the camera between them; none on a tripod."""
     made: dict[str, np.ndarray] = {}
     for number, (right, up) in enumerate(studio.scene.bracket.plate_turn_deg):
         if right or up:
             progress(f"plate frame {number}, turned by {right} and {up} degrees")
-            ideal = (-float(np.tan(np.radians(right))), float(np.tan(np.radians(up))))  # where the old axis is seen
-            pose = aim(studio.pose(studio.scene.plate), ideal)
+            pose = turned(studio.pose(studio.scene.plate), (right, up))
             people = studio.place.photographer(studio.pose(studio.scene.plate))
             world = studio.place.load(people, prints=not studio.scene.bare_plate)
             measure = path_radiance(studio.mi, world, studio.scene.sampling.depth)
             raw = studio.photograph(measure, pose, studio.scene.sampling.plate, 40_000 + 1000 * number)
             made[f"plate_{number}"] = studio.sharp(raw)
+    return made
+
+
+def ball_pictures(studio: Studio, progress: Callable[[str], None]) -> dict[str, np.ndarray]:
+    """Ball views (H, W, 3) by name, and their frames that a hand turned, "ball_a_0" and so on from the darkest."""
+    made: dict[str, np.ndarray] = {}
+    for view in studio.scene.ball_view:
+        progress(f"{view.name}: mirror ball")
+        made[view.name] = ball_picture(studio, view)
+        for number, (right, up) in enumerate(studio.scene.bracket.ball_turn_deg):
+            if right or up:
+                progress(f"{view.name} frame {number}, turned by {right} and {up} degrees")
+                made[f"{view.name}_{number}"] = ball_picture(studio, view, number)
     return made
 
 

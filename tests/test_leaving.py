@@ -19,6 +19,7 @@ from pipeline.simulation.scene_file import BoxModel, DentFacts, LampFacts, Simul
 from pipeline.simulation.world import Place, rectangles
 from pipeline.transport.proxies import box
 from pipeline.transport.variant import use_mitsuba
+from stages import simulate
 from stages.simulate import Studio, turned_plates
 
 ROOM = {
@@ -128,6 +129,9 @@ def test_frames_that_are_not_taken_are_refused(tmp_path: Path) -> None:
         load_scene(path)
     path.write_text(text.replace("ball_frames = 6", "ball_frames = 6\nplate_turn_deg = [[0.1, 0.0]]"))
     with pytest.raises(ManifestError, match="plate_turn_deg has 1 entries"):
+        load_scene(path)
+    path.write_text(text.replace("ball_frames = 6", "ball_frames = 6\nball_turn_deg = [[0.1, 0.0]]"))
+    with pytest.raises(ManifestError, match="ball_turn_deg has 1 entries"):
         load_scene(path)
 
 
@@ -277,3 +281,32 @@ def test_a_hand_turns_each_plate_frame_by_what_is_stated(monkeypatch) -> None:
     pictures = {"plate": np.full((4, 4, 3), 9.0)} | {view.name: np.ones((4, 4, 3)) for view in scene.ball_view} | made
     capture.take_brackets(capture.Shoot(scene, Path(), capture.sensor_of(scene)), pictures)
     assert [shot[f"plate/plate_ev{ev}.dng"] for ev in ("-2", "0", "+2")] == [1.0, 9.0, 2.0]
+
+
+def test_a_hand_turns_frames_of_the_ball(monkeypatch) -> None:
+    """A turned frame is another picture, with noise of its own; the others are the view as it stands."""
+    turns = [(0.0, 0.0), (0.2, -0.1), (0.0, 0.0)]
+    scene = table_scene()
+    bracket = scene.bracket.model_copy(update={"ball_turn_deg": turns, "ball_frames": 3})
+    scene = scene.model_copy(update={"bracket": bracket})
+    seeds: list[int] = []
+
+    def photograph(self: Studio, measure: object, pose: np.ndarray, samples: int, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        x, _, z = pose[:3, :3].T @ self.pose(self.scene.plate)[:3, 2]  # where the old axis is seen
+        return np.full((*self.shape, 4), np.arctan2(-x, z))
+
+    monkeypatch.setattr(Studio, "photograph", photograph)
+    monkeypatch.setattr(simulate, "spread_light", lambda light, *_: 0 * light)
+    mi = use_mitsuba()
+    made = simulate.ball_pictures(Studio(scene, mi, Place(mi, scene), capture.lens_of(scene.camera)), lambda _: None)
+    name = scene.ball_view[0].name
+    assert list(made)[:2] == [name, f"{name}_1"]
+    assert np.degrees(made[f"{name}_1"].mean()) == pytest.approx(0.2, abs=1e-6)
+    assert made[name].max() == 0
+    assert len(set(seeds)) == len(made)
+    shot: dict[str, float] = {}
+    monkeypatch.setattr(capture.Shoot, "metered", lambda self, pictures, fill: 0)
+    monkeypatch.setattr(capture.Shoot, "take", lambda self, name, rgb, third: shot.update({name: float(rgb.mean())}))
+    capture.take_brackets(capture.Shoot(scene, Path(), capture.sensor_of(scene)), {"plate": np.ones((4, 4, 3)), **made})
+    assert [shot[f"{name}/{name}_{number}.dng"] > 0 for number in (1, 2, 3)] == [False, True, False]

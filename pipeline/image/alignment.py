@@ -24,6 +24,9 @@ LEAST_PX = 1.0  # half a CFA cell: less cannot be mended by whole cells, and blu
 LEAST_SIGMAS = 5.0  # a shift that is no more than its uncertainty is none
 LARGEST_SHARE = 0.03  # of the frame's width
 DISAGREEMENT_PX = 1.0  # of quadrants beyond their noise: rotation, or something that moves
+LEAST_SHARE = 0.05  # of a box, clear in both frames
+GUARD_CELLS = 4  # round what clips in one of the frames: left out
+LEAST_STRUCTURE = 2.0  # gradients of the picture over those of its noise, known to a tenth: a twentieth of the shift
 STEPS = 8  # of Lucas-Kanade, each from the whole cells found so far
 
 
@@ -124,15 +127,26 @@ def _quadrants(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
 
 
 def _measure_patch(first: Exposed, second: Exposed, box: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Shift (2,) [px] and covariance of one box: coarse by phase correlation, then Lucas-Kanade about whole cells."""
+    """Shift (2,) [px] and covariance of one box: coarse by phase correlation, then Lucas-Kanade about whole cells.
+
+    The frames' ratio is that of their sums, which no shift changes: exposures need not be known. What surrounds clipped
+    cells is left out: a lamp that clips in one frame only is no structure that both show.
+    """
     import cv2
+    from scipy.ndimage import binary_dilation
 
     a, b = _cells(first, box), _cells(second, box)
     scale = 2.0 if first.mosaic.ndim == 2 else 1.0
-    if min(a.shape) < 16 or np.mean(np.isfinite(a) & np.isfinite(b)) < 0.05:
+    clear = np.isfinite(a) & np.isfinite(b)
+    if min(a.shape) < 16 or np.mean(clear) < LEAST_SHARE:
         return None
     cap = min(np.nanmax(a), np.nanmax(b))  # what clips in one frame looks alike in both
     flat = [np.sqrt(np.clip(np.nan_to_num(part, nan=cap), 0, cap)).astype(np.float32) for part in (a, b)]
+    wide = ~binary_dilation(~clear, iterations=GUARD_CELLS)
+    clear = wide if np.mean(wide) >= LEAST_SHARE else clear
+    a, b = np.where(clear, a, np.nan), np.where(clear, b, np.nan)
+    if (gain := float(np.nansum(b, dtype=float) / max(np.nansum(a, dtype=float), 1e-300))) > 0:
+        a, first = np.float32(gain) * a, replace(first, exposure=first.exposure / gain)
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(flat[0], flat[1], window)
     for whole in (np.rint([x, y]).astype(int), np.zeros(2, int)):
@@ -170,29 +184,38 @@ def _cells(frame: Exposed, box: tuple[slice, slice]) -> np.ndarray:
 def _lucas_kanade(
     a: np.ndarray, b: np.ndarray, first: Exposed, second: Exposed
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Shift (dx, dy) of b against a in elements, and its covariance; None without structure beyond the noise."""
+    """Shift (dx, dy) of b against a in elements, and its covariance; None without structure beyond the noise.
+
+    Gradients of noise would draw the shift to zero: what they add to the normal matrix is known, and taken off.
+    """
     if min(a.shape) < 8:
         return None
     middle = (slice(1, -1), slice(1, -1))
-    difference, mean = (b - a)[middle], np.maximum((a + b)[middle] / 2, 0)
-    both = (a + b) / 2
+    samples = 4 if first.mosaic.ndim == 2 else first.mosaic.shape[2]
+    level = max(float(np.nanmean(a + b)) / 2, 0.0)
+    parts = [_noise(frame, level, samples) for frame in (first, second)]
+    share = parts[1] / (parts[0] + parts[1])  # of the first frame in the gradient: the quieter one has more
+    both = share * a + (1 - share) * b
+    difference, mean = (b - a)[middle], np.maximum(both[middle], 0)
     gy, gx = (both[2:, 1:-1] - both[:-2, 1:-1]) / 2, (both[1:-1, 2:] - both[1:-1, :-2]) / 2
     clear = np.isfinite(difference) & np.isfinite(gx) & np.isfinite(gy)
     if np.count_nonzero(clear) < 100:
         return None
     difference, mean, gx, gy = difference[clear], mean[clear], gx[clear], gy[clear]
-    samples = 4 if first.mosaic.ndim == 2 else first.mosaic.shape[2]
-    noise = sum(
-        (frame.noise.shot.mean() * mean / frame.exposure + frame.noise.floor.mean() / frame.exposure**2) / samples
-        for frame in (first, second)
-    )
-    weight = 1 / (noise + (0.01 * mean) ** 2)
-    normal = np.array([[np.sum(weight * p * q) for q in (gx, gy)] for p in (gx, gy)])
-    mimic = float(np.sum(weight * noise)) / 8  # what noise alone gives to each diagonal
-    if np.linalg.eigvalsh(normal)[0] < 100 + 3 * mimic:
+    noise = [_noise(frame, mean, samples) for frame in (first, second)]
+    weight = 1 / (noise[0] + noise[1] + (0.01 * mean) ** 2)
+    found = np.array([[np.sum(weight * p * q) for q in (gx, gy)] for p in (gx, gy)])
+    mimic = float(np.sum(weight * (share**2 * noise[0] + (1 - share) ** 2 * noise[1]))) / 2  # noise's own gradients
+    normal = found - mimic * np.eye(2)
+    if np.linalg.eigvalsh(normal)[0] < 100 + LEAST_STRUCTURE * mimic:
         return None
-    covariance = np.linalg.inv(normal)
-    return -covariance @ np.array([np.sum(weight * p * difference) for p in (gx, gy)]), covariance
+    inverse = np.linalg.inv(normal)
+    return -inverse @ np.array([np.sum(weight * p * difference) for p in (gx, gy)]), inverse @ found @ inverse
+
+
+def _noise(frame: Exposed, level: Any, samples: int) -> Any:
+    """Variance of the mean of a cell's samples at a level (...) of radiance."""
+    return (frame.noise.shot.mean() * level / frame.exposure + frame.noise.floor.mean() / frame.exposure**2) / samples
 
 
 def _moved(frame: Exposed, dx: float, dy: float) -> Exposed:

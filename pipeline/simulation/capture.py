@@ -103,7 +103,9 @@ def take_brackets(shoot: Shoot, pictures: dict[str, np.ndarray]) -> None:
     shortest = shoot.metered([pictures[name] for name in names], bracket.ball_fill)
     for name in names:
         for number, file in enumerate(frames[name]):
-            shoot.take(file, pictures[name], shortest - 3 * bracket.ball_step_ev * number)
+            shoot.take(
+                file, pictures.get(f"{name}_{number}", pictures[name]), shortest - 3 * bracket.ball_step_ev * number
+            )
 
 
 def srgb_jpeg(acescg: np.ndarray, sensor: Sensor, seed: int, kind: str = "calibration", exif: bytes = b"") -> bytes:

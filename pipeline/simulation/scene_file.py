@@ -218,8 +218,9 @@ class WrongLabel(Strict):
 class BracketFacts(Strict):
     """Exposures: the fullest channel of the plate's middle frame and of the shortest ball frame.
 
-    A ``ball_fill`` above 1 lets the brightest light clip in every frame. ``plate_turn_deg``: the plate is held by hand,
-    and each frame is turned to the right and upwards by so much.
+    A ``ball_fill`` above 1 lets the brightest light clip in every frame. ``plate_turn_deg``, ``ball_turn_deg``: a hand
+    is on the camera, and each frame of the plate, or of every ball view from its darkest, is turned to the right and
+    upwards by so much.
     """
 
     plate_ev: list[int] = Field([-2, 0, 2], min_length=1)
@@ -228,6 +229,7 @@ class BracketFacts(Strict):
     ball_step_ev: int = Field(2, ge=1, le=4)
     ball_fill: float = Field(0.8, gt=0, le=1e5)
     plate_turn_deg: list[Span] = Field([])
+    ball_turn_deg: list[Span] = Field([])
     wrong_label: list[WrongLabel] = Field([])
     started: str = Field("2026:03:14 10:00:00", description="EXIF time of the first frame")
 
@@ -329,6 +331,9 @@ class SimulatedScene(Strict):
         turns = self.bracket.plate_turn_deg
         if turns and len(turns) != len(self.bracket.plate_ev):
             raise ValueError(f"bracket.plate_turn_deg has {len(turns)} entries; expected one per frame of plate_ev")
+        turns = self.bracket.ball_turn_deg
+        if turns and len(turns) != self.bracket.ball_frames:
+            raise ValueError(f"bracket.ball_turn_deg has {len(turns)} entries; expected one per frame of ball_frames")
         taken = {file for files in self.frames().values() for file in files}
         if strange := [wrong.file for wrong in self.bracket.wrong_label if wrong.file not in taken]:
             raise ValueError(f"bracket.wrong_label: no frame {strange}; expected some of {sorted(taken)}")
