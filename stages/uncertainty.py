@@ -242,8 +242,8 @@ def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
     """The emitters on the texels that a turned map has them on."""
     moved = []
     for emitter in studio.emitters:
-        alone = np.zeros(studio.rgb.shape)
-        alone.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 1.0
+        alone = np.zeros((*studio.rgb.shape[:2], 1))
+        alone.reshape(-1)[np.asarray(emitter.texels, int)] = 1.0
         texels = np.flatnonzero(light.turned(alone, turn)[..., 0] > 0.5)
         moved.append(emitter.model_copy(update={"texels": texels}))
     return moved

@@ -81,6 +81,7 @@ def scale_covariance(shared: np.ndarray, balance: np.ndarray | None) -> np.ndarr
 def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
     """One pattern per emitter: all its texels by the relative sigma that it states, less what all light shares."""
     rgb, found = environment.rgb().astype(float), []
+    level = sides(np.maximum(rgb, 0))
     height, width = environment.shape
     for emitter in emitters:
         inside = np.zeros((height, width, 1), bool)
@@ -89,7 +90,9 @@ def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarr
             emitter.irradiance_sigma, emitter.irradiance, out=np.zeros(3), where=np.asarray(emitter.irradiance) > 0
         )
         relative = np.sqrt(np.maximum(stated**2 - shared**2, 0))
-        found.append(_radiance(f"flux_{emitter.name}", "flux", np.where(inside, rgb, 0) * relative, rgb, emitter))
+        added = np.where(inside, rgb, 0) * relative
+        bound = relative_change(sides(added), level)
+        found.append(Pattern(f"flux_{emitter.name}", "flux", bound, radiance=added, emitter=emitter))
     return found
 
 
@@ -105,20 +108,26 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     sigma = sigma - unseen
     rows = alike_rows(environment)
     level = np.maximum(rgb, 0)
-    lobes, direct = [], np.zeros(3)
+    unsure, energy = weight * sigma, weight * level
+    lobes, sizes, changes, direct = [], [], [], np.zeros(3)
     for axis in AXES:
         cosine = np.maximum(directions @ axis, 0)[..., None]
         lobe = cosine**2
-        errors = cell_sums(weight * lobe * sigma, rows)
-        energy = (weight * lobe * level).sum((0, 1))
-        lobes.append(lobe * level * np.sqrt((errors**2).sum(0)) / np.maximum(energy, 1e-300))
-        direct += (cell_sums(weight * cosine * sigma, rows) ** 2).sum(0)
+        size = np.sqrt((cell_sums(lobe * unsure, rows) ** 2).sum(0))
+        size /= np.maximum(np.einsum("hwk,hwc->c", lobe, energy), 1e-300)
+        lobes.append(lobe)
+        sizes.append(size)
+        changes.append(size * sides(lobe * level))
+        direct += (cell_sums(cosine * unsure, rows) ** 2).sum(0)
     # Six numbers average what varies within a lobe: as much is given back as irradiance has of it.
-    carried = sum((irradiance(resize_environment(lobe, *BOUND_MAP), AXES) ** 2).sum(0) for lobe in lobes)
+    carried = np.square(changes).sum((0, 1))
     back = np.sqrt(np.divide(direct, carried, out=np.ones(3), where=carried > 0))
-    found = [_radiance(f"sky_{name}", "sky", lobe * back, rgb) for name, lobe in zip(AXIS_NAMES, lobes, strict=True)]
+    before, found = sides(level), []
+    for name, lobe, size, change in zip(AXIS_NAMES, lobes, sizes, changes, strict=True):
+        bound = relative_change(change * back, before)
+        found.append(Pattern(f"sky_{name}", "sky", bound, radiance=lobe * level * (size * back)))
     if unseen.any():
-        found.append(_radiance("unseen", "unseen", unseen, rgb))
+        found.append(Pattern("unseen", "unseen", relative_change(sides(unseen), before), radiance=unseen))
     return [pattern for pattern in found if pattern.bound > 0]
 
 
@@ -140,7 +149,7 @@ def direction_covariance(balls: dict[str, BallFit], views: dict[str, View]) -> n
 def turn_patterns(environment: Raster, covariance: np.ndarray) -> list[Pattern]:
     """Three independent turns of the map by its covariance (3, 3) rad^2."""
     values, vectors = np.linalg.eigh(covariance)
-    small = resize_environment(np.maximum(environment.rgb(), 0), *BOUND_MAP)
+    small = coarse(np.maximum(environment.rgb(), 0))
     before = irradiance(small, AXES)
     found = []
     for number, (value, vector) in enumerate(sorted(zip(values, vectors.T), key=lambda pair: -pair[0])):
@@ -163,7 +172,7 @@ def turned(rgb: np.ndarray, turn: np.ndarray) -> np.ndarray:
     lower = rgb[below, left % width] * (1 - across) + rgb[below, (left + 1) % width] * across
     result = upper * (1 - down) + lower * down
     energy = total_energy(result)
-    return np.asarray(result * np.divide(total_energy(rgb), energy, out=np.ones(3), where=energy > 0))
+    return np.asarray(result * np.divide(total_energy(rgb), energy, out=np.ones(len(energy)), where=energy > 0))
 
 
 def narrow_half_angle(emitter: Emitter, spread_rad: float) -> float:
@@ -215,7 +224,7 @@ def width_patterns(environment: Raster, emitters: list[Emitter]) -> list[Pattern
         ratio = narrow_half_angle(emitter, spread) / max(emitter.half_angle_rad, 1e-9)
         texels = np.asarray(emitter.texels, int)
         lost.reshape(-1, 3)[texels] = (1 - ratio) / 2 * rgb.reshape(-1, 3)[texels]
-    bound = _radiance("width", "width", lost, rgb).bound
+    bound = relative_change(sides(lost), sides(np.maximum(rgb, 0)))
     return [Pattern("width", "width", bound, lamps=narrowed(rgb, emitters, spread))]
 
 
@@ -225,10 +234,14 @@ def relative_change(change: np.ndarray, level: np.ndarray) -> float:
     return float(np.max(np.linalg.norm(change, axis=1) / np.maximum(before, 1e-300)))
 
 
-def _radiance(name: str, source: str, added: np.ndarray, rgb: np.ndarray, emitter: Emitter | None = None) -> Pattern:
-    small, level = (resize_environment(values, *BOUND_MAP) for values in (added, np.maximum(rgb, 0)))
-    bound = relative_change(irradiance(small, AXES), irradiance(level, AXES))
-    return Pattern(name, source, bound, radiance=added, emitter=emitter)
+def coarse(rgb: np.ndarray) -> np.ndarray:
+    """A map (H, W, 3) on `BOUND_MAP`: its rows first, which lie in memory as they are summed."""
+    return resize_environment(resize_environment(rgb, BOUND_MAP[0], rgb.shape[1]), *BOUND_MAP)
+
+
+def sides(rgb: np.ndarray) -> np.ndarray:
+    """Irradiance (6, 3) that a map (H, W, 3) gives the sides of a box."""
+    return irradiance(coarse(rgb), AXES)
 
 
 def worth_following(patterns: list[Pattern], share: float) -> tuple[list[Pattern], list[Pattern]]:

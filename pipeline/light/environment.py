@@ -64,12 +64,16 @@ def resize_environment(rgb: np.ndarray, height: int, width: int) -> np.ndarray:
     Weights are the solid angles that old and new texels share, so any ratio is allowed; enlarging repeats texels.
     """
     old_height, old_width = rgb.shape[:2]
-    rows = _overlap(
-        np.cos(np.pi * np.arange(old_height + 1) / old_height), np.cos(np.pi * np.arange(height + 1) / height)
-    )
-    columns = _overlap(np.arange(old_width + 1) / old_width, np.arange(width + 1) / width)
-    narrow = np.einsum("hwc,vw->hvc", np.asarray(rgb, float), columns, optimize=True)
-    return np.einsum("hvc,uh->uvc", narrow, rows, optimize=True)
+    result = np.array(rgb, float)
+    if width != old_width:
+        columns = _overlap(np.arange(old_width + 1) / old_width, np.arange(width + 1) / width)
+        result = np.einsum("hwc,vw->hvc", result, columns, optimize=True)
+    if height != old_height:
+        rows = _overlap(
+            np.cos(np.pi * np.arange(old_height + 1) / old_height), np.cos(np.pi * np.arange(height + 1) / height)
+        )
+        result = np.einsum("hvc,uh->uvc", result, rows, optimize=True)
+    return result
 
 
 def _overlap(old: np.ndarray, new: np.ndarray) -> np.ndarray:
