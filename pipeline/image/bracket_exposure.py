@@ -22,7 +22,6 @@ from pipeline.types import Frame
 
 LIGHT_WARNING = 0.01  # static scene against shared settings
 CLEAR_OF_LIMIT = 0.95
-JUDGED = 100_000  # samples of a pair that tell whether it is proportional
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +79,7 @@ def label_evidence(costs: Mapping[str, tuple[float, np.ndarray]], exposures: Exp
         return {
             **term,
             "could_cost": "up to 7 % between parts of the range that different frames cover: labels round",
+            "bound_rel": 0.07,
         }
     whole = {view: abs(factor / unit - 1) for view, (factor, _) in costs.items()}
     bands = {view: float(np.nanmax(np.abs(each / unit - 1), initial=0.0)) for view, (_, each) in costs.items()}
@@ -139,17 +139,23 @@ def _ratios(
             one = exposure.measure_ratio(a.ravel(), b.ravel(), label, limit, (models[long], models[other]))
             if one is not None:
                 found.append(Ratio(long, other, *one))
-                _judge(samples[long].frame, samples[other].frame, a, b, limit, label, warnings)
+                _judge(samples[long].frame, samples[other].frame, a, b, limit, label, float(np.exp(one[0])), warnings)
                 break
     return found
 
 
 def _judge(
-    long: Frame, short: Frame, a: np.ndarray, b: np.ndarray, limit: float, label: float, warnings: list[str]
+    long: Frame,
+    short: Frame,
+    a: np.ndarray,
+    b: np.ndarray,
+    limit: float,
+    label: float,
+    ratio: float,
+    warnings: list[str],
 ) -> None:
     """Warn of frames that are not one sensor's at two exposures, and of a filter that is not neutral."""
-    every = slice(None, None, max(1, a.size // JUDGED))
-    levels, logs, sigmas = computational.groups_of(a.ravel()[every], b.ravel()[every], CLEAR_OF_LIMIT * limit)
+    levels, logs, sigmas = computational.groups_of(a, b, CLEAR_OF_LIMIT * limit, ratio)
     if why := computational.not_proportional(levels, logs, sigmas, float(np.log(label))):
         warnings.append(f"{short.file}, {long.file}: {why}")
     if long.nd_stops == short.nd_stops:
