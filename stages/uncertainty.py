@@ -133,27 +133,33 @@ class Studio:
         return np.asarray(irradiance(rgb, self.plane.normal[None])[0])
 
     @functools.cached_property
-    def lit(self) -> Worlds:
-        """The scene under the whole light."""
-        return self.worlds(1.0)
+    def surfaces(self) -> Worlds:
+        """The scene without light."""
+        return self.unlit(1.0)
 
-    def worlds(self, ground: float) -> Worlds:
-        """The scene under the whole light, its real surfaces ``ground`` times as bright."""
+    def unlit(self, ground: float) -> Worlds:
+        """The scene without light, its real surfaces ``ground`` times as bright."""
         proxies = [
             proxy if proxy.albedo is None else proxy.model_copy(update={"albedo": ground * proxy.albedo})
             for proxy in self.proxies
         ]
-        return build_worlds(
-            self.plane, ground * self.albedo, self.rgb, self.dark, proxies, self.emitters, self.surface, self.occluders
-        )
+        albedo, night = ground * self.albedo, np.zeros((1, 2, 3))
+        return build_worlds(self.plane, albedo, night, self.dark, proxies, (), self.surface, self.occluders)
 
-    def under(self, rgb: np.ndarray, emitters: list[Emitter]) -> Seen:
-        """A render under another map; surfaces are the same."""
-        return self.seen(relit(self.lit, rgb, emitters))
+    def seen(self, rgb: np.ndarray, emitters: list[Emitter]) -> Seen:
+        """A render under a map."""
+        return self.seen_in(self.surfaces, rgb, emitters)
 
-    def seen(self, worlds: Worlds) -> Seen:
-        """A render."""
-        return rendered(worlds, self.rays, self.grid, self.samples, DEPTH, seed=1)
+    def dim(self) -> Seen:
+        """A render under the whole light over a `DIMMER` ground."""
+        return self.seen_in(self.unlit(DIMMER), self.rgb, self.emitters)
+
+    def seen_in(self, unlit: Worlds, rgb: np.ndarray, emitters: list[Emitter]) -> Seen:
+        """A render of a scene under a map, whose lights are gone afterwards: the next one's get the same numbers.
+
+        They are part of a compiled kernel, so that lights of one kind need one kernel.
+        """
+        return rendered(relit(unlit, rgb, emitters), self.rays, self.grid, self.samples, DEPTH, seed=1)
 
 
 def rms(variance: np.ndarray) -> np.ndarray:
@@ -210,19 +216,20 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
     """What each pattern makes of the composite."""
     if not followed:
         return []
-    whole = studio.seen(studio.lit)
-    response = Response(studio.grid, full, whole, studio.seen(studio.worlds(DIMMER)))
+    dim = studio.dim()  # before there are other surfaces, as lights
+    whole = studio.seen(studio.rgb, studio.emitters)
+    response = Response(studio.grid, full, whole, dim)
     modes = []
     for pattern in followed:
         if pattern.factor is not None:
             change = response.of_factor(pattern.factor)
         elif pattern.radiance is not None:
-            seen = studio.under(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
+            seen = studio.seen(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
             change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
         elif pattern.lamps is not None:
             narrow = pattern.lamps
             # Of shadows alone: a highlight narrower than the grid's squares would be met by chance, and keeps its sum.
-            lost = studio.under(narrow.rgb, narrow.emitters).lost - whole.lost
+            lost = studio.seen(narrow.rgb, narrow.emitters).lost - whole.lost
             apart = Seen(lost, np.zeros_like(lost), np.zeros_like(lost))
             share = (studio.upward(narrow.rgb) - studio.irradiance) / studio.irradiance
             change = response.of_turn(apart, share)
@@ -231,7 +238,7 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             angle = float(np.linalg.norm(pattern.turn))
             step = pattern.turn * STEP_RAD / angle
             moved = light.turned(studio.rgb, step)
-            apart = studio.under(moved, moved_emitters(studio, step)).minus(whole)
+            apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
             share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
             change = angle / STEP_RAD * response.of_turn(apart, share)
         modes.append(pixels.Mode(pattern.name, pattern.source, change.astype(np.float32)))
@@ -252,7 +259,7 @@ def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
 def geometry_modes(studio: Studio, composite: Raster, plate: Raster, share: float) -> list[pixels.Mode]:
     """What pose and lens make of the composite: objects and shadows are drawn elsewhere, the plate stays."""
     grid, window = studio.grid, studio.grid.window
-    points, px, on_object = points_on(studio.lit, studio.rays, grid)
+    points, px, on_object = points_on(studio.surfaces, studio.rays, grid)
     if not len(points):
         return []
     alpha = composite["obj.A"][window][..., None]
