@@ -53,7 +53,7 @@ def compute(
     if stated.get("given") or stated.get("former") or photos:
         whole = calibrated(facts, "camera", stated, frame, photos, params)
     elif reconstruction.names:
-        whole = from_tracks(reconstruction, frame)
+        whole = from_tracks(reconstruction, frame, params)
     else:
         lens_name = (facts.get("lens") or {}).get("name") or ""
         camera, numbers, warnings, evidence = exif_camera(_known(frame), lens_name)
@@ -130,14 +130,14 @@ def of_optics(camera: Camera, frame: Frame | None) -> Camera:
     return camera.model_copy(update={"body": frame.camera, "lens": frame.lens, "focal_mm": frame.focal_mm})
 
 
-def from_tracks(reconstruction: Reconstruction, frame: Frame | None) -> Result:
+def from_tracks(reconstruction: Reconstruction, frame: Frame | None, params: knobs.Calibrate) -> Result:
     """The plate's camera from the tracks of the reconstruction, for want of board photographs."""
     if "plate" not in reconstruction.names:
         raise CaptureError(
             "plate: hangs together with none of the further views, needed one and the same lens in both; photograph "
             "them nearer to the plate's place, or a board for [camera] calibration"
         )
-    camera, numbers, evidence = self_calibrated(reconstruction, 0)
+    camera, numbers, evidence = self_calibrated(reconstruction, 0, params.distortion)
     warnings = []
     if numbers["focal_sigma_rel"] > 0.01:
         warnings.append(
@@ -174,7 +174,7 @@ def calibrated(
         return Result({"camera": camera}, {"source": "given"}, [], [term])
     warnings: list[str] = []
     photos, size = corners_of(facts, board_photos, warnings)
-    chosen, warnings = best_lens(photos, size, warnings)
+    chosen, warnings = best_lens(photos, size, warnings, params.distortion)
     judged = judge(chosen.fit, chosen.photos, chosen.errors, chosen.evidence, warnings, params)
     return replace(judged, outputs={"camera": of_optics(judged.outputs["camera"], frame)})
 

@@ -28,6 +28,10 @@ class Merge(Params):
         "all", description="of a bracket: all, every second, or the shortest and the longest"
     )
     weights: Literal["poisson", "optimal"] = Field("optimal", description="per-sample weights")
+    align: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="frames of a view brought onto each other: where they lie a pixel apart, or always, or never",
+    )
     estimate_exposures: bool = Field(True, description="estimate exposure ratios instead of trusting labels")
     noise: Literal["stated", "measured"] = Field(
         "stated", description="[[noise]] or NoiseProfile, or what the frames show, where both are there"
@@ -65,6 +69,9 @@ class Calibrate(Params):
     """Intrinsics from board photographs."""
 
     max_rms_px: float = Field(1.0, gt=0, description="refuse a calibration with a larger residual [px]")
+    distortion: Literal["auto", "always", "never"] = Field(
+        "auto", description="terms of a lens that is fitted: those that held-out photographs gain by, all, or none"
+    )
 
 
 class Pose(Params):
@@ -114,6 +121,9 @@ class Reflectance(Params):
     model: Literal["uniform", "textured"] = Field("textured", description="albedo model of the plane")
     route: Literal["ratio", "gradient"] = Field(
         "ratio", description="albedo by equation 8, or refined by differentiable rendering (slow)"
+    )
+    gloss: Literal["auto", "always", "never"] = Field(
+        "auto", description="specular lobe of the plane: if held-out cells ask for it, the likeliest, or none"
     )
     texture_px: int = Field(1024, ge=16, le=8192, description="size of the albedo texture [px]")
 

@@ -80,7 +80,8 @@ def compute(
     if near is None:
         points = window_points(plane, texture.window, shape)
         eye = view.world_from_camera[:3, 3]
-        surface = climb(cells_of(values, texture.variance, known, points, eye), environment.rgb(), plane.normal)
+        cells = cells_of(values, texture.variance, known, points, eye)
+        surface = climb(cells, environment.rgb(), plane.normal, params.gloss)
         if surface.model != "diffuse":
             measured = base_of(surface, values, environment.rgb(), plane.normal, points, eye)
             known &= np.isfinite(measured).all(-1)
@@ -137,7 +138,7 @@ def compute(
         bounce_evidence(near.estimate if near else None, ignored),
         *([gradient_evidence(fitted)] if fitted else []),
         shadow_evidence(list(ratios), shadow),
-        explain(surface),
+        explain(surface, params.gloss),
     ]
     outputs = {"albedo": raster, "surface": surface, "local_proxies": local_proxies}
     return Result(outputs, numbers, warnings, terms)

@@ -15,9 +15,9 @@ from stages import knobs, reflectance
 LAMP = lamp_and_sky(400.0, (0.05, 0.62, -0.75))  # its mirror image lies in the middle of the plate
 
 
-def solve(plate: Raster, environment: np.ndarray = LAMP):
+def solve(plate: Raster, environment: np.ndarray = LAMP, gloss: str = "auto"):
     light = Raster(Raster.split(environment), "acescg")
-    params = knobs.Reflectance(texture_px=256)
+    params = knobs.Reflectance(texture_px=256, gloss=gloss)
     return reflectance.compute(
         {"plate": plate}, CAMERA, {"plate": VIEW}, light, [], ground(), [], [], params
     )  # fmt: skip
@@ -81,6 +81,18 @@ def test_a_metal_plane_climbs_to_the_top():
     assert surface.metallic == 1
     assert surface.roughness == pytest.approx(0.3, abs=0.03)
     assert base_error(result, truth) < 0.05
+
+
+def test_gloss_is_forced_in_and_out():
+    """On a glossy plane: forced in it is the one that evidence takes; left out, its cost is said."""
+    glossy = photograph(texture(3), LAMP, {"roughness": 0.4, "f0": 0.05}, samples=8)
+    assert solve(glossy, gloss="always").outputs["surface"].model == "rough"
+    matt = solve(glossy, gloss="never")
+    assert matt.outputs["surface"].model == "diffuse"
+    row = next(row for row in matt.evidence if row["term"] == "specular lobe of the ground")
+    assert not row["modelled"]
+    assert row["bound_rel"] > 0.01
+    assert "reflectance.gloss = never" in row["because"]
 
 
 def test_lobes_against_a_sum_over_every_texel():

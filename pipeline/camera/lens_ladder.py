@@ -72,14 +72,22 @@ class Climbed:
     evidence: list[dict[str, Any]]
 
 
-def best_lens(photos: Photos, size: tuple[int, int], warnings: list[str]) -> tuple[Climbed, list[str]]:
+def best_lens(
+    photos: Photos, size: tuple[int, int], warnings: list[str], distortion: str = "auto"
+) -> tuple[Climbed, list[str]]:
     """The lens that the photographs ask for, and the warnings with those of the photographs that were left out.
+
+    ``distortion``: "auto", or "always" and "never" for all of the ladder's terms and none, whatever they ask for.
 
     Wide lenses, a fisheye and the rational one from a wide start, are offered on evidence only: a residual or a pattern
     that no board has, photographs that agree with no other lens, a model that ends within the frame, or a denominator
     that was needed. All are then judged on the photographs of the wide lens that keeps most.
     """
     said: list[str] = []
+    if distortion != "auto":
+        start, poses = first_calibration(photos.world_m, photos.px, size)
+        kept, poses = drop_bad(start, photos, poses, said)
+        return forced(start, poses, kept, distortion), warnings + said
     narrow: Climbed | None = None
     try:
         start, poses = first_calibration(photos.world_m, photos.px, size)
@@ -334,6 +342,33 @@ def climb(start: Camera, poses: list[np.ndarray], photos: Photos, ladder: tuple[
     return Climbed(chosen, photos, terms, best, errors, list(evidence.values()))
 
 
+def forced(start: Camera, poses: list[np.ndarray], photos: Photos, distortion: str) -> Climbed:
+    """The lens of all terms that the photographs determine ("always"), or of none ("never"), whatever is gained."""
+    terms: tuple[str, ...] = ()
+    chosen, best = fit_model(start, poses, photos, terms), held_out(start, poses, photos, terms)
+    errors = {"none": float(np.sqrt(best.mean()))}
+    rows: list[dict[str, Any]] = []
+    for step in LADDER:
+        because = f"knob calibrate.distortion = {distortion}"
+        row = {"term": f"lens {' '.join(step)}", "modelled": False, "because": because, "could_cost": ""}
+        rows.append(row)
+        if distortion == "never":
+            row |= cost_of(step, (), chosen, start, poses, photos)
+            continue
+        try:
+            chosen = fit_model(start, poses, photos, terms + step)
+        except NumericalError:
+            row |= {"could_cost": "unknown", "no_bound": "these photographs do not determine it", **TRIED}
+            continue
+        terms += step
+        error = held_out(start, poses, photos, terms)
+        said = f"{because}; held-out error {np.sqrt(best.mean()):.4f} -> {np.sqrt(error.mean()):.4f} px"
+        row |= {"modelled": True, "because": said}
+        best = error
+        errors[" ".join(terms)] = float(np.sqrt(error.mean()))
+    return Climbed(chosen, photos, terms, best, errors, rows)
+
+
 def cost_of(
     step: tuple[str, ...],
     terms: tuple[str, ...],
@@ -352,9 +387,9 @@ def cost_of(
 
 def bound_of(shift_px: float) -> dict[str, Any]:
     """What evidence says of a lens that is so far from another, rms over the frame; infinite where one of them ends."""
-    return (
-        {"bound_px": float(shift_px)} if np.isfinite(shift_px) else {"no_bound": "one of the lenses ends in the frame"}
-    )
+    if not np.isfinite(shift_px):
+        return {"no_bound": "one of the lenses ends within the frame"}
+    return {"bound_px": float(shift_px)}
 
 
 def improvement(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> tuple[float, float]:

@@ -86,11 +86,14 @@ def scaled_covariance(covariance: np.ndarray, pose: np.ndarray, sigma: float) ->
     return covariance + np.outer(along, along)
 
 
-def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, dict[str, Any], list[dict[str, Any]]]:
+def self_calibrated(
+    reconstruction: Reconstruction, body: int, distortion: str = "auto"
+) -> tuple[Camera, dict[str, Any], list[dict[str, Any]]]:
     """Lens of one body from the tracks alone, with covariance; numbers and evidence.
 
     One focal length and the principal point (held near the middle by a prior of 2 % of the long side) are free; terms
     of distortion are added while the robust deviance of the same tracks falls by more than nine per parameter.
+    ``distortion``: as in `lens_ladder.best_lens`.
     """
     start = reconstruction.cameras[body]
     long = max(start.width, start.height)
@@ -113,14 +116,15 @@ def self_calibrated(reconstruction: Reconstruction, body: int) -> tuple[Camera, 
     terms: tuple[str, ...] = ()
     best = fit(terms, richest.bundle, richest)
     evidence = []
+    said = "" if distortion == "auto" else f"knob calibrate.distortion = {distortion}; "
     for step in LADDER:
         richer = fit(terms + step, richest.bundle, richest)
         gain = best.deviance - richer.deviance
-        taken = bool(gain > NEEDED_DEVIANCE * len(step))
+        taken = bool(gain > NEEDED_DEVIANCE * len(step)) if distortion == "auto" else distortion == "always"
         apart = disagreement(best.bundle.cameras[body], richer.bundle.cameras[body])
         evidence.append({
             "term": f"lens {' '.join(step)}", "modelled": taken,
-            "because": f"deviance of the tracks falls by {gain:.0f} (needs {NEEDED_DEVIANCE * len(step):g})",
+            "because": said + f"deviance of the tracks falls by {gain:.0f} (needs {NEEDED_DEVIANCE * len(step):g})",
             "could_cost": "" if taken else f"{apart:.3f} px rms over the frame",
             **({} if taken else TRIED | bound_of(apart)),
         })  # fmt: skip

@@ -166,8 +166,11 @@ def best(
     return chosen, density, mean[chosen]
 
 
-def climb(cells: Cells, environment: np.ndarray, normal: np.ndarray) -> Surface:
-    """The surface that held-out cells ask for under a map (H, W, 3), with one row of scores per rung."""
+def climb(cells: Cells, environment: np.ndarray, normal: np.ndarray, gloss: str = "auto") -> Surface:
+    """The surface that held-out cells ask for under a map (H, W, 3), with one row of scores per rung.
+
+    ``gloss``: "always" takes the likelier of the glossy ones whether or not it wins, "never" the diffuse one.
+    """
     if len(cells.radiance) < MIN_CELLS:
         return Surface(scores=[{"model": "diffuse", "because": f"only {len(cells.radiance)} cells are seen"}])
     found = lobes(lights_of(environment), normal, cells.view, ROUGHNESS)
@@ -187,8 +190,10 @@ def climb(cells: Cells, environment: np.ndarray, normal: np.ndarray) -> Surface:
         against = rows[taken]["model"]
         gain, sigmas = margin(held_out[name], held_out[against], cells.block)
         rows[number] |= {"against": against, "gain": gain, "sigmas": sigmas}
-        if gain > MIN_GAIN and sigmas > MIN_SIGMAS:
+        if gloss == "auto" and gain > MIN_GAIN and sigmas > MIN_SIGMAS:
             taken = number
+    if gloss == "always" and np.isfinite(max(rows[1]["held_out"], rows[2]["held_out"])):
+        taken = max((1, 2), key=lambda number: rows[number]["held_out"])
     asked = rows[taken or 1]
     if np.isfinite(asked["gain"]):
         asked["taken_for_matt"] = taken_for_matt(cells, environment, normal, asked)
@@ -329,8 +334,9 @@ def cells_of(
     return Cells(mean(radiance)[kept], noise[kept], view[kept], block[kept])
 
 
-def explain(surface: Surface) -> dict[str, Any]:
-    """The rung that was taken, and why, as evidence."""
+def explain(surface: Surface, gloss: str = "auto") -> dict[str, Any]:
+    """The rung that was taken, and why, as evidence; ``gloss``: what was asked for, as in `climb`."""
+    forced = "" if gloss == "auto" else f"knob reflectance.gloss = {gloss}; "
     scores = "; ".join(
         f"{row['model']} {row['gain']:+.1f} nats ({row['sigmas']:.1f} sigma) over {row['against']}"
         for row in surface.scores
@@ -344,7 +350,7 @@ def explain(surface: Surface) -> dict[str, Any]:
     return {
         "term": "specular lobe of the ground",
         "modelled": modelled,
-        "because": f"held-out log-likelihood: {scores}" if scores else surface.scores[0]["because"],
+        "because": forced + (f"held-out log-likelihood: {scores}" if scores else surface.scores[0]["because"]),
         "could_cost": cost,
         **({"no_bound": "no gloss was tried"} if wrong is None else {"bound_rel": wrong, **TRIED}),
     }
