@@ -9,7 +9,8 @@ to the variance. The equations and their sources: pipeline/image, from bracket_n
 radiometry.py on.
 
 Unit: one per capture, ``(DN - black) / (white - black) * N^2 * 100 / (t * ISO)``, with t as estimated.
-Limits: frames of a view are moved whole when they lie a pixel apart, else left; what turns is refused. Views that
+Limits: frames of a view are moved whole when they lie a pixel apart, else left (noise and exposures are then estimated
+again, from what all of them show); what turns is refused. Views that
 neither stand where the plate was taken from nor share body and exposure setting with a view that is tied to it are
 scaled by their labels.
 """
@@ -115,32 +116,23 @@ def merge_brackets(
     entries = [(view, frame) for view, bracket in sorted(brackets.items()) for frame in _ordered(bracket.frames)]
     views = [view for view, _ in entries]
     photographs = _Photographs([frame for _, frame in entries], decode)
-    frames, samples, warnings = photographs.frames, photographs.samples, photographs.warnings
-    sensor = bracket_noise.sensor_of(views, samples, given, params.noise)
-    if params.estimate_exposures:
-        exposures = bracket_exposure.estimate(views, samples, sensor.models, sensor.limits, still, own)
-    else:
-        exposures = bracket_exposure.by_labels(frames)
+    frames, warnings = photographs.frames, photographs.warnings
+
+    def estimated(samples: list[Sample]) -> tuple[Sensor, Exposures]:
+        sensor = bracket_noise.sensor_of(views, samples, given, params.noise)
+        if not params.estimate_exposures:
+            return sensor, bracket_exposure.by_labels(frames)
+        return sensor, bracket_exposure.estimate(views, samples, sensor.models, sensor.limits, still, own)
+
+    sensor, exposures = estimated(photographs.samples)
+    found = _merge_views(brackets, views, photographs, sensor, exposures, params)
+    if found.moved:  # what was estimated compared pixels that do not show the same
+        sensor, exposures = estimated([found.moved.get(i, one) for i, one in enumerate(photographs.samples)])
+        found = _merge_views(brackets, views, photographs, sensor, exposures, params)
+    merged, numbers, aligned = found.merged, found.numbers, found.aligned
     warnings += [*sensor.warnings, *exposures.warnings]
     profiles = colour_profiles(brackets, warnings)
-    merged: dict[str, Merged] = {}
-    numbers: dict[str, Any] = {}
-    listing: dict[str, list[dict[str, Any]]] = {}
-    aligned: dict[str, tuple[float, dict[str, Any]]] = {}
-    labels: dict[str, tuple[float, np.ndarray]] = {}
     for view in brackets:
-        members = [i for i, name in enumerate(views) if name == view]
-        exposed = [photographs.exposed(i, sensor, exposures) for i in members]
-        exposed, shift, said = alignment.align(exposed, [frames[i].file for i in members])
-        aligned[view] = (shift or 0.0, said)
-        listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
-        merged[view] = radiometry.merge(exposed, params.weights, os.cpu_count() or 1)
-        if view != CHART_VIEW and not view.startswith(FLAT_VIEW):
-            labels[view] = _label_cost(merged[view], exposed, [frames[i] for i in members])
-        exposed.clear()
-        photographs.release(members)
-        merged[view], hot = _without_defects(merged[view], photographs.defects(members))
-        numbers[view] = _view_numbers(merged[view], hot, len(members))
         _warn_extremes(view, numbers[view], warnings)
     patterns = _add_fixed_patterns(merged, views, frames, sensor)
     for view, pattern in patterns.items():
@@ -150,8 +142,47 @@ def merge_brackets(
     rasters = {view: raster_of(one, frames[views.index(view)], profiles[view]) for view, one in merged.items()}
     totals = {"noise": sensor.numbers, **exposures.numbers, "optical_black": photographs.black_numbers}
     totals |= {"shift_px": max((shift for shift, _ in aligned.values()), default=0.0)}
-    evidence = _evidence(sensor, exposures, aligned, numbers, patterns, labels, warnings)
-    return Result({"mosaics": rasters, "exposures": listing}, {"views": numbers, **totals}, warnings, evidence)
+    evidence = _evidence(sensor, exposures, aligned, numbers, patterns, found.labels, warnings)
+    return Result({"mosaics": rasters, "exposures": found.listing}, {"views": numbers, **totals}, warnings, evidence)
+
+
+@dataclass
+class _Views:
+    """What came of each view; ``moved``: statistics of frames by index, of views whose frames were moved."""
+
+    merged: dict[str, Merged] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    listing: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    aligned: dict[str, tuple[float, dict[str, Any]]] = field(default_factory=dict)
+    labels: dict[str, tuple[float, np.ndarray]] = field(default_factory=dict)
+    moved: dict[int, Sample] = field(default_factory=dict)
+
+
+def _merge_views(
+    brackets: Mapping[str, Bracket], views: Sequence[str], photographs: _Photographs, sensor: Sensor,
+    exposures: Exposures, params: knobs.Merge,
+) -> _Views:  # fmt: skip
+    """Every view aligned, merged and mended, one after the other."""
+    found, frames, threads = _Views(), photographs.frames, os.cpu_count() or 1
+    for view in brackets:
+        members = [i for i, name in enumerate(views) if name == view]
+        taken = [photographs.exposed(i, sensor, exposures) for i in members]
+        exposed, shift, said = alignment.align(taken, [frames[i].file for i in members], params.align)
+        merged = radiometry.merge(exposed, params.weights, threads)
+        if any(one is not other for one, other in zip(exposed, taken, strict=True)):
+            said |= alignment.cost(merged.radiance, radiometry.merge(taken, params.weights, threads).radiance, shift)
+            samples = [bracket_noise.sample_of(one.mosaic, frames[i]) for i, one in zip(members, exposed)]
+            found.moved |= dict(zip(members, bracket_noise.shown_by_all(samples), strict=True))
+        found.aligned[view] = (shift or 0.0, said)
+        found.listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
+        if view != CHART_VIEW and not view.startswith(FLAT_VIEW):
+            found.labels[view] = _label_cost(merged, exposed, [frames[i] for i in members])
+        exposed.clear()
+        taken.clear()
+        photographs.release(members)
+        found.merged[view], hot = _without_defects(merged, photographs.defects(members))
+        found.numbers[view] = _view_numbers(found.merged[view], hot, len(members))
+    return found
 
 
 def _ordered(frames: list[Frame]) -> list[Frame]:
@@ -379,7 +410,7 @@ def _evidence(
             warnings.append(f"{view}: frames lay up to {shift:.2f} px apart and were moved; use a tripod")
         elif shift > SHIFT_WARNING_PX:
             warnings.append(f"{view}: frames are shifted by up to {shift:.2f} px and are not aligned; use a tripod")
-    worst = max(aligned.values(), key=lambda one: (one[1]["modelled"], one[0]), default=None)
+    worst = max(aligned.values(), key=lambda one: (one[1].get("predicted_rel", -1.0), one[0]), default=None)
     ghosts = max((n["ghost_fraction"] for n in numbers.values()), default=0.0)
     sources = sorted({model.source for model in sensor.models})
     knees = sorted({one["linear_to"] for one in sensor.numbers.values() if "linear_to" in one})

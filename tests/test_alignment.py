@@ -114,3 +114,22 @@ def test_without_structure_nothing_is_said_to_be_known():
     same, _, evidence = alignment.align(frames, NAMES[:2])
     assert same[0] is frames[0]
     assert "no structure" in evidence["because"]
+
+
+def test_what_a_shift_would_cost_is_the_light_that_it_carries_away():
+    """Of a lamp of 30 % of the light, moved to another square: 30 %. What stays within its square costs nothing."""
+    aligned = np.full((48, 60), 0.7 / (48 * 60))
+    aligned[20, 20] += 0.3
+    far, near = (np.roll(aligned, step, 1) for step in (5, -2))
+    assert alignment.cost(aligned, far, 3.0)["predicted_rel"] == pytest.approx(0.3, abs=1e-12)
+    assert alignment.cost(aligned, near, 3.0)["predicted_rel"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_alignment_can_be_forced_and_forbidden():
+    frames = bracket([(0, 0), (0, 0), (4, 0)])
+    same, shift, evidence = alignment.align(frames, NAMES, "never")
+    assert all(one is other for one, other in zip(same, frames, strict=True))
+    assert shift == pytest.approx(4, abs=0.1)
+    assert evidence["modelled"] is False
+    assert "merge.align = never" in evidence["because"]
+    assert alignment.align(bracket([(0, 0), (0.3, 0), (0, 0)]), NAMES, "always")[2]["modelled"] is True

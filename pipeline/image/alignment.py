@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -45,10 +45,13 @@ class Shift:
         return float(np.hypot(self.dx, self.dy))
 
 
-def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed], float | None, dict[str, Any]]:
+def align(
+    frames: Sequence[Exposed], names: Sequence[str], when: Literal["auto", "always", "never"] = "auto"
+) -> tuple[list[Exposed], float | None, dict[str, Any]]:
     """Frames of a view, moved onto the one of middle exposure where they lie off it; largest shift [px]; evidence.
 
-    What a moved frame does not show at its edges is NaN. Raises CaptureError when the motion is too large or no shift.
+    ``when``: if the shift asks for it, or always, or never. What a moved frame does not show at its edges is NaN.
+    Raises CaptureError when the motion is too large or no shift.
     """
     order = np.argsort([frame.exposure for frame in frames], kind="stable")
     shifts = [measure(frames[i], frames[j]) for i, j in pairwise(order)]
@@ -72,11 +75,32 @@ def align(frames: Sequence[Exposed], names: Sequence[str]) -> tuple[list[Exposed
     sigma = max(shift.sigma for shift in known)
     largest = float(np.hypot(*places.T).max())
     said = f"largest shift {largest:.3f} +- {sigma:.3f} px, quadrants within {max(s.quadrants for s in known):.2f} px"
-    if largest < max(LEAST_PX, LEAST_SIGMAS * sigma):
+    needed = max(LEAST_PX, LEAST_SIGMAS * sigma)
+    if when == "never" or (when == "auto" and largest < needed) or largest == 0:
+        said += f"; knob merge.align = {when}" if largest >= needed else ""
         return list(frames), largest, {**_evidence(False, said, f"blur of {largest:.3f} px"), "bound_px": largest}
     moved = [_moved(frame, *place) for frame, place in zip(frames, places, strict=True)]
     left = "up to a pixel and what turned" if frames[0].mosaic.ndim == 2 else "noise of moved frames is smoothed"
     return moved, largest, _evidence(True, said, left)
+
+
+def cost(aligned: np.ndarray, unmoved: np.ndarray, shift: float | None) -> dict[str, Any]:
+    """What frames left where they lie would do, for the row of evidence: how much of the light would lie elsewhere.
+
+    ``aligned``, ``unmoved``: merged radiance (H, W) or (H, W, 3). Compared on squares of twice the ``shift`` [px]:
+    detail that stays within one is blurred, light that leaves it comes from another direction. Half of the sum of
+    differences is what moved, be it from square to square or away.
+    """
+    side = 2 * max(1, round(shift or 0.0))
+    sums = []
+    for picture in (aligned, unmoved):
+        height, width = picture.shape[0] // side * side, picture.shape[1] // side * side
+        whole = np.nan_to_num(picture[:height, :width], nan=0.0, posinf=0.0, neginf=0.0).astype(float)
+        sums.append(whole.reshape(height // side, side, width // side, side, -1).sum((1, 3)))
+    light = float(np.abs(sums[0]).sum())
+    moved = float(np.abs(sums[1] - sums[0]).sum()) / 2 / light if light > 0 else 0.0
+    text = f"{moved:.1%} of the view's light would lie elsewhere by more than the shift"
+    return {"could_cost": f"{text}; left is up to a pixel and what turned", "predicted_rel": moved}
 
 
 def _evidence(modelled: bool, because: str, could_cost: str) -> dict[str, Any]:

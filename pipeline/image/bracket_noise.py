@@ -69,6 +69,13 @@ def sample_of(samples: np.ndarray, frame: Frame) -> Sample:
     return Sample(frame, rows, (mean - black) * scale, (top - black) * scale, side)
 
 
+def shown_by_all(samples: Sequence[Sample]) -> list[Sample]:
+    """Samples of frames that were moved by whole cells, their rows cut to the rectangle in which none is NaN."""
+    shown = np.logical_and.reduce([np.isfinite(one.rows).reshape(*one.rows.shape[:2], -1).all(-1) for one in samples])
+    lines, columns = shown.any(1), shown.any(0)
+    return [replace(one, rows=one.rows[lines][:, columns]) for one in samples]
+
+
 def neighbours(views: Sequence[str]) -> list[tuple[int, int]]:
     """Index pairs (longer, shorter) of frames that follow each other in a view, sorted from the shortest."""
     return [(i + 1, i) for i in range(len(views) - 1) if views[i] == views[i + 1]]
