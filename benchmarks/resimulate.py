@@ -8,7 +8,8 @@ are rendered at that size.
 All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern, hot photosites, JPEG
 noise of the board photographs, corners (so lens and pose of its own) and shutter: each setting of the dial is off by
 `DIAL`, each frame by `FRAME` more. Its cameras are turned by up to a pixel, so that lamps and edges fall otherwise
-on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`).
+on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`). How
+soft its ball views are, which decides how a mosaic samples small lamps and nobody states, is drawn from `BALL_PX`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from stages import simulate
 
 WIDTH = 512  # px of a frame: wider truths are halved until they fit
 SAMPLING = {"ball": 64, "calibration": 32, "environment": 64, "environment_width": 256}
-BLUR_PX = 0.76  # of the lens: at 0.55 lamps, 2 px small in the ball, alias on the mosaic by 3 % of their colour
+BLUR_PX = 0.76  # of plate and board photographs: a sharper one could not be resampled by a part of a pixel
+BALL_PX = (0.6, 0.85)  # of a ball view, uniform: from nearly as sharp as the bundled captures to a little out of focus
 DIAL = 0.01  # of log time, of each setting of the shutter; real ones are off by up to several percent
 CORNER_PX = 0.1  # of each corner, as the pose stage takes its own at the full size
 FRAME = 0.002  # of log time, of each frame: what one setting repeats to
@@ -112,6 +114,13 @@ def reduce_truth(bundled: Path, folder: Path, shape: tuple[int, int], factor: in
     return pictures["plate"]
 
 
+def sharpest(studio: simulate.Studio) -> simulate.Studio:
+    """With a lens as sharp as the sharpest that ball views are seen through."""
+    camera = studio.scene.camera.model_copy(update={"blur_sigma_px": BALL_PX[0]})
+    scene = studio.scene.model_copy(update={"camera": camera})
+    return simulate.Studio(scene, studio.mi, studio.place, studio.lens)
+
+
 def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     """Radiance of all photographs; truth and objects are written into ``folder``. Minutes."""
     mi, scene = use_mitsuba(), reduced(whole)
@@ -123,7 +132,7 @@ def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     plate = reduce_truth(bundled, folder / "truth", studio.shape, factor_of(whole), whole.camera.blur_sigma_px)
     record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, {})
     capture.write_truth(folder / "truth" / "truth.json", record)
-    balls = {view.name: simulate.ball_picture(studio, view) for view in scene.ball_view}
+    balls = {view.name: simulate.ball_picture(sharpest(studio), view) for view in scene.ball_view}
     measure, sigma = studio.radiance(), scene.camera.blur_sigma_px
     boards = []
     for number, photo in enumerate(scene.calibration):
@@ -154,6 +163,12 @@ class Reshoot(capture.Shoot):
         self.off[third] = self.now
         self.exposures[name]["true_s"] *= self.now
         self.now = 1.0
+
+
+def softer_px(scene: SimulatedScene) -> dict[str, float]:
+    """Sigma [px] that each ball view is blurred by beyond the least of `BALL_PX`."""
+    random = np.random.default_rng([scene.seed, 8])
+    return {view.name: float(np.sqrt(random.uniform(*BALL_PX) ** 2 - BALL_PX[0] ** 2)) for view in scene.ball_view}
 
 
 def turns(scene: SimulatedScene) -> dict[str, np.ndarray]:
@@ -225,14 +240,20 @@ def write_poses(scene: SimulatedScene, manifest: Path, turned: dict[str, np.ndar
 
 def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: Path, out: Path) -> None:
     """Write capture ``number`` into ``out``; objects are a link to those in ``shared``."""
+    from scipy.ndimage import gaussian_filter
+
     scene = scene.model_copy(update={"seed": scene.seed + 1000 * (number + 1)})
     out.mkdir(parents=True)
     (out / "objects").symlink_to((shared / "objects").resolve())
-    turned, lens = turns(scene), capture.lens_of(scene.camera)
+    turned, lens, soft = turns(scene), capture.lens_of(scene.camera), softer_px(scene)
     shoot = Reshoot(scene, out, capture.sensor_of(scene))
     capture.write_manifests(scene, out)
     write_poses(scene, out / "capture.toml", turned)
-    shots = {**pictures.balls, "plate": pictures.plate}
+    balls = {
+        name: gaussian_filter(ball, (soft[name], soft[name], 0), mode="nearest")
+        for name, ball in pictures.balls.items()
+    }
+    shots = {**balls, "plate": pictures.plate}
     capture.take_brackets(shoot, {name: seen_turned(lens, shot, turned[name]) for name, shot in shots.items()})
     for board, picture in enumerate(pictures.boards):
         write_bytes(out / "calibration" / f"calib_{board:02d}.jpg", capture.srgb_jpeg(picture, shoot.sensor, board))

@@ -17,7 +17,7 @@ from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, resolution, smooth
-from pipeline.light.alike import ALIKE, ALIKE_VIEWS
+from pipeline.light.alike import ALIKE, ALIKE_VIEWS, RAISED
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
 from pipeline.probes import clipped, combine, filling, ground_gloss, levelling
@@ -68,11 +68,11 @@ def compute(
             f"room: the probe, at {np.round(centre, 2).tolist()} m, lies outside; correct centre_m, size_m"
         )
     near = near_field.assess(rgb, centre, near_field.places_of(wishes, centre[1]), room, params.near_budget, eye[:3, 3])
-    recovered = lamps.recovered
+    recovered, raised = lamps.recovered, 1 + (merged.disagreement - 1) * (1 - laid)
     if room and near.target is not None:
-        maps_of = [rgb, variance, np.stack([seen, over, recovered], -1)]
+        maps_of = [rgb, variance, np.stack([seen, over, recovered, raised], -1)]
         rgb, variance, rest = near_field.relocate(maps_of, room.depth, centre, near.target)
-        seen, over, recovered = np.moveaxis(rest, -1, 0)
+        seen, over, recovered, raised = np.moveaxis(rest, -1, 0)
     numbers |= near.numbers
     numbers |= {"plane_from_plate_fraction": float((laid * latlong_solid_angles(*seen.shape)).sum() / (4 * np.pi))}
     differing, filled = combine.disagreement_numbers(merged), filling.report(rgb, known, gap)
@@ -85,6 +85,7 @@ def compute(
             "seen": seen.astype(np.float32),
             "clipped": over.astype(np.float32),
             "recovered": recovered.astype(np.float32),
+            RAISED: raised.astype(np.float32),
         },
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}

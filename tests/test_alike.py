@@ -51,9 +51,13 @@ def test_noise_is_alike_within_a_pixel_and_a_displacement_cancels_about_a_lamp()
     noise, sampled = 0.1 / 4, alike.sampling_sigma(fine, lamp)
     # About an even lamp slopes point inwards all round: of 16 errors, those of one side undo those of the other.
     assert alike.displaced_sums(0.1 * lamp, rgb) == pytest.approx(np.zeros((2, 3)), abs=0.01 * 0.1 * lamp.sum() / 3)
-    assert alike.flux_sigma(fine, texels, direction) == pytest.approx(np.maximum(noise, sampled) * flux, rel=0.03)
-    one = alike.flux_sigma(map_of(rgb, 0.1 * rgb, {alike.ALIKE: "12"}), texels, direction)  # a pixel of six texels
-    assert one == pytest.approx(flux * np.maximum(0.1, alike.sampling_sigma(map_of(rgb, 0, {alike.ALIKE: "12"}), lamp)))
+    assert alike.flux_sigma(fine, texels, direction) == pytest.approx(np.hypot(noise, sampled) * flux, rel=0.03)
+    one = alike.flux_sigma(map_of(rgb, 0.1 * rgb, {alike.ALIKE: "12"}), texels, direction)  # two pixels of six rows
+    sampled = alike.sampling_sigma(map_of(rgb, 0, {alike.ALIKE: "12"}), lamp)
+    assert one == pytest.approx(flux * np.hypot(0.1 / np.sqrt(2), sampled), rel=1e-3)
+    # What views disagree by about a lamp is displacement and sampling: its sum takes the variance that was not raised.
+    twice = map_of(rgb, 0.2 * rgb, {alike.ALIKE: "12"}, **{alike.RAISED: np.full((256, 512), 4.0)})
+    assert alike.flux_sigma(twice, texels, direction) == pytest.approx(one)
 
 
 def test_half_a_lamp_errs_by_its_displacement():
@@ -149,16 +153,17 @@ def errors(radius_px: int, half_angle_deg: float, method: Method, seeds: int = 2
     return np.array(rows)
 
 
-@pytest.mark.parametrize(("radius_px", "half_angle_deg", "method"), [(60, 4.0, "malvar"), (120, 2.0, "bilinear")])
-def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg, method):
-    """Lamps of 20 pixels. Measured over 21 lamps each: rms of error over sigma, Malvar and bilinear, 0.68 and 1.3
-    (60 px, 2 degrees: 10 pixels), 0.59 and 0.71 (60, 4), 0.58 and 0.75 (120, 2), 0.65 and 0.55 (120, 4).
-    Here 14 lamps of 3 channels: 0.51 +- 0.05 and 0.66 +- 0.13, by the scatter of lamps. Two standard errors below
-    either is 0.4: sigma larger by 1.3 and 1.6 fails.
+@pytest.mark.parametrize(("radius_px", "half_angle_deg"), [(60, 4.0), (120, 2.0)])
+def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg):
+    """Lamps of 20 pixels, lens and pixel 0.55 px together, at the sharper end of what the law is the mean of.
+
+    Measured over 21 lamps each, rms of error over sigma: 0.79 (60 px, 2 degrees), 0.90 (60, 4), 0.93 (120, 2), 0.78
+    (120, 4). Here 14 lamps of 3 channels, of which red and blue err together: 28 independent numbers, so that an rms
+    of 0.9 scatters by 0.9 / sqrt(56) = 0.12. Outside 0.55 to 1.25 sigma is wrong by a third.
     """
-    z = errors(radius_px, half_angle_deg, method)
+    z = errors(radius_px, half_angle_deg, "bilinear")
     assert len(z) >= 10
-    assert 0.4 < np.sqrt((z**2).mean()) < 1.1
+    assert 0.55 < np.sqrt((z**2).mean()) < 1.25
     assert (np.abs(z) < 2).mean() > 0.9
 
 
@@ -169,7 +174,7 @@ def test_sampling_counts_the_pixels_that_a_lamp_covers():
     weight = latlong_solid_angles(256, 512)[..., None]
     pixel = float(np.degrees(np.sqrt(weight.reshape(-1)[texels].sum() / 10)))  # the lamp covers ten
     told = map_of(rgb, 0.0, {alike.ALIKE: repr(alike.ALIKE_PX * pixel)})
-    assert alike.sampling_sigma(told, weight * alone) == pytest.approx(alike.SAMPLED / 10, rel=1e-3)
+    assert alike.sampling_sigma(told, weight * alone) == pytest.approx(alike.sampled(10.0), rel=1e-3)
     both = map_of(rgb, 0.0, {alike.ALIKE: repr(alike.ALIKE_PX * pixel), alike.ALIKE_VIEWS: "2"})
-    assert alike.sampling_sigma(both, weight * alone) == pytest.approx(alike.SAMPLED / 10 / np.sqrt(2), rel=1e-3)
+    assert alike.sampling_sigma(both, weight * alone) == pytest.approx(alike.sampled(10.0) / np.sqrt(2), rel=1e-3)
     assert not alike.sampling_sigma(map_of(rgb, 0.0, {}), weight * alone).any()

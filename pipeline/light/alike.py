@@ -5,7 +5,9 @@ probe, reflectance of the ball) is stated in the map's header. What one flux was
 rest is the probe's picture: where it is displaced, texels within a few pixels err together, so those count as alike
 within cells, and as independent beyond. About a whole lamp they err with both signs, brighter where it moved to, darker
 where it left: that cancels. How its pixels sample a small lamp, each colour of a mosaic by itself, no texel knows: that
-error is the lamp's, by the pixels that it covers.
+error is the lamp's, by the pixels that it covers (`sampled`). Where views differ, texels were given a larger variance
+for it (channel ``raised``); about a lamp they differ by just that, a displacement and its sampling, so that a lamp's
+sum takes the variance that was not raised.
 """
 
 from __future__ import annotations
@@ -20,12 +22,10 @@ ALIKE = "insitu:alike_deg"  # in a map's header: width of the cells within which
 ALIKE_VIEWS = "insitu:alike_views"  # in a map's header: how many equal views its light is the mean of
 ALIKE_PX = 3.0  # pixels of the probe's picture: demosaicking takes in two to each side
 ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
-# Relative error of a lamp's light (R, G, B) times the pixels that it covers, each colour sampled by a mosaic by itself.
-# Errors over the sigma that it gives, rms: 0.6 to 0.7 for lamps of 2 to 4 degrees, 10 to 80 pixels, in balls of 60 and
-# 120 px by Malvar; 0.55 to 0.75 by bilinear demosaicking from 20 pixels on, 1.3 at ten; 1.05 for the desk's three lamps
-# in one view, of which one colour is off by 2.4 (tests/test_alike.py, tests/test_flux_whole.py). Small lamps err by
-# more than in proportion: the rule is theirs.
-SAMPLED = np.array([2.0, 1.0, 2.0])
+RAISED = "raised"  # of a map: what texels' variances were multiplied by because views differ, 1 where not
+# Relative error of a lamp's light by the n pixels that it covers: (POINT exp(-n / FADES) , SPREAD / n), squares added,
+# of red and blue, each a quarter of an RGGB mosaic; of green, half of it, a `GREEN` of that. See `sampled`.
+POINT, FADES, SPREAD, GREEN = 7.0, 3.45, 1.5, 0.4
 
 
 def alike_rows(environment: Raster) -> int:
@@ -64,19 +64,33 @@ def cell_sums(values: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate(sums)
 
 
+def sampled(pixels: float) -> np.ndarray:
+    """Relative sigma (3,) of the light of a lamp that a mosaic's bilinear picture shows ``pixels`` pixels large.
+
+    Bilinear kernels keep each colour's sum, so a colour's light is a sum over its own photosites, which by Poisson's
+    formula is off by the lamp's picture at the photosites' frequency: 1/2 per pixel for red and blue, along rows and
+    along columns, and for green 1/2 along both. A point behind a lens and pixel of b px together has
+    ``exp(-2 pi^2 b^2 / 4)`` of its light there, and covers 4 pi b^2 px and what the kernels add, so that its error
+    falls with the exponential of the area; the edge of a larger disc has (area)^(-3/4) of that, here 1 / area.
+    """
+    of_quarter = np.hypot(POINT * np.exp(-pixels / FADES), SPREAD / pixels)
+    return np.asarray(np.minimum(of_quarter * np.array([1, GREEN, 1]), 1))
+
+
 def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     """Relative sigma (3,) of the sum of ``light`` (H, W, 3) by the pixels that it covers; zero where no map says so.
 
-    Covered is ``(sum L)^2 / sum L^2`` over solid angle. It is at most 1. Views lie on their mosaics independently.
+    Covered is ``(sum L)^2 / sum L^2`` over solid angle, of green, whose own error moves it least. Views lie on their
+    mosaics independently.
     """
     if ALIKE not in environment.attributes:
         return np.zeros(3)
     pixel = np.radians(float(environment.attributes[ALIKE]) / ALIKE_PX) ** 2
-    solid = latlong_solid_angles(*environment.shape)[..., None]
-    squares = (np.square(light) / solid).sum((0, 1))
-    covered = np.divide(light.sum((0, 1)) ** 2, squares, out=np.full(3, np.inf), where=squares > 0)
+    solid, green = latlong_solid_angles(*environment.shape), light[..., 1]
+    squares = float((np.square(green) / solid).sum())
+    covered = float(green.sum()) ** 2 / squares if squares > 0 else 0.0
     views = float(environment.attributes.get(ALIKE_VIEWS, 1.0))
-    return np.asarray(np.minimum(SAMPLED / np.maximum(covered / pixel, 1) / np.sqrt(views), 1))
+    return sampled(max(covered / pixel, 1.0)) / np.sqrt(views)
 
 
 def displaced_sums(values: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -98,10 +112,9 @@ def displaced_sums(values: np.ndarray, light: np.ndarray) -> np.ndarray:
 def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Sigma (3,) of the irradiance that texels (N,), flat indices, give a surface that faces ``direction`` (3,).
 
-    A texel's own variance is noise, alike within a pixel of the probe's picture; or a displacement of that picture; or,
-    where views differ by how their mosaics sampled a lamp, it was raised for that. Which, it does not say: the largest
-    of the three counts. Recovered texels share one error, and their variance holds the map's own scale. Zero for a map
-    without variance.
+    A texel's own variance, as it was before views that differ raised it, is noise, alike within a pixel of the probe's
+    picture, or a displacement of that picture; which, it does not say: the larger counts, beside what sampling adds.
+    Recovered texels share one error, and their variance holds the map's own scale. Zero for a map without variance.
     """
     height, width = environment.shape
     inside = np.zeros((height, width), bool)
@@ -110,12 +123,13 @@ def flux_sigma(environment: Raster, texels: np.ndarray, direction: np.ndarray) -
     weight = (weight * inside)[..., None]
     shared, told = shared_sigma_of(environment), environment.channels.get("recovered", np.zeros((height, width))) > 0
     one = weight * own_sigma(environment, np.zeros(3)) * told[..., None]
-    own = weight * own_sigma(environment, shared) * ~told[..., None]
+    raised = environment.channels.get(RAISED, np.ones((height, width)))
+    own = weight * own_sigma(environment, shared) / np.sqrt(raised)[..., None] * ~told[..., None]
     measured = weight * environment.rgb() * ~told[..., None]
     all_of_it = shared * measured.sum((0, 1))
     known = "variance.R" in environment.channels
-    sampled = sampling_sigma(environment, measured) * measured.sum((0, 1))
+    by_mosaic = sampling_sigma(environment, measured) * measured.sum((0, 1))
     pixel = max(1, round(alike_rows(environment) / ALIKE_PX))
-    causes = (cell_sums(own, pixel) ** 2).sum(0), (displaced_sums(own, environment.rgb()) ** 2).sum(0), sampled**2
-    total = one.sum((0, 1)) ** 2 + known * (np.max(causes, 0) + all_of_it**2)
+    causes = (cell_sums(own, pixel) ** 2).sum(0), (displaced_sums(own, environment.rgb()) ** 2).sum(0)
+    total = one.sum((0, 1)) ** 2 + known * (np.max(causes, 0) + by_mosaic**2 + all_of_it**2)
     return np.asarray(np.sqrt(total))

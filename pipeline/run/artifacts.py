@@ -77,8 +77,9 @@ BALLS = Artifact("balls", "json", "fitted mirror ball of each ball view", "m", t
 ENVIRONMENT = Artifact(
     "environment",
     "raster",
-    "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1); relative "
-    "sigma that all texels share, and how far apart they err alike, in the header",
+    "world-oriented lat-long at the ball: R G B, variance.RGB, seen, clipped (0..1), recovered (0 or 1), raised "
+    "(by what disagreement of views multiplied the variance); relative sigma that all texels share, and how far apart "
+    "they err alike, in the header",
     RADIANCE_UNIT,
     ACESCG,
 )
