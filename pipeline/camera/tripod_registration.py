@@ -4,7 +4,8 @@ The pictures are averaged down and made even in tone; windows with texture measu
 intensity, gain and offset free (Lucas and Kanade 1981; window shifts as in Kybic and Unser 2003), starting from the
 peak of the whole pictures' phase correlation. A robust fit of one small rotation through the lens says which windows
 belong to the still scene: what was put in or taken out (ball, board, their shadows) is left out. Covariance: the
-windows' scatter about the rotation, as windows of one picture share no pixels. What the rotation leaves is fitted by an
+windows' scatter about the rotation, as windows of one picture share no pixels, and what interpolation makes of a turn,
+nothing for none. What the rotation leaves is fitted by an
 affine field, with covariance, and told at the objects' feet. Limits: a rotation only is undone, as a tripod that is
 knocked turns far more than it shifts; turns of less than half a window.
 """
@@ -31,8 +32,8 @@ BLURS_PX = (4.0, 2.0, 1.0, 0.0)  # from coarse to fine, as a shift is found from
 ROUNDS, SETTLED_PX = 6, 2e-3
 LEAST_LIKENESS = 0.7  # correlation of a window with its place in the other picture
 GATE = 4.0
-SYSTEMATIC_PX = 0.02  # that all windows share: interpolation; 0.015 px is measured at a turn of 7 px
-FLOOR_PX = 0.02  # windows agree no better than interpolation does
+SYSTEMATIC_PX = 0.02  # at most, that all windows share: interpolation; 0.015 px is measured at a turn of 7 px
+FLOOR_PX = 0.02  # in weights, windows agree no better than interpolation does
 SHIFTED_PX = 1.0  # at a foot: beyond it the plate is not where the board was seen
 CLEAR = 3.0  # standard uncertainties from which what a turn leaves is no noise
 
@@ -41,7 +42,8 @@ CLEAR = 3.0  # standard uncertainties from which what a turn leaves is no noise
 class Registration:
     """Rotation vector (3,) rad with ``p_other = exp(rotation) p_plate`` in camera frames, and its covariance (3, 3).
 
-    ``rest`` (3, 2) px and ``rest_covariance`` (3, 3): what it leaves, as in `pipeline.types.Motion`.
+    ``rest`` (3, 2) px and ``rest_covariance`` (3, 3): what it leaves, as in `pipeline.types.Motion`. ``evidence``: chi2
+    of having turned at all holds `SYSTEMATIC_PX` and `FLOOR_PX` against it whole, so that less is no motion.
     """
 
     rotation: np.ndarray
@@ -83,17 +85,35 @@ def registered(plate: np.ndarray, other: np.ndarray, camera: Camera) -> Registra
             f"{LEAST_SHARE:.0%}; show the board in the plate, or photograph [views]"
         )
     weight = 1 / (sigma[good] ** 2 + noise**2)
-    normal = np.einsum("n,nki,nkj->ij", weight, turn[good], turn[good])
-    covariance = np.linalg.inv(normal) + (SYSTEMATIC_PX * step / camera.fx) ** 2 * np.eye(3)
-    moved = np.hypot(*(turn @ rotation).T) * step
+    left = (measured - turn @ rotation)[good]
+    moved = np.hypot(*(turn @ rotation).T)
+    share = min(1.0, 2 * np.pi * float(np.sqrt((moved**2).mean())))  # interpolation errs as a sine of the shift
+    between = SYSTEMATIC_PX * share
+    covariance = scattered(turn[good], weight, left) + (between * step / camera.fx) ** 2 * np.eye(3)
     along = affine(centre[good], camera)
-    rest_covariance = np.linalg.inv(along.T @ (weight[:, None] * along))
-    rest = rest_covariance @ along.T @ (weight[:, None] * (measured - turn @ rotation)[good]) * step
-    return Registration(rotation, (covariance + covariance.T) / 2, rest, rest_covariance * step**2, {
+    rest = np.linalg.solve(along.T @ (weight[:, None] * along), along.T @ (weight[:, None] * left))
+    # from the scatter about the turn, of which a rest is part: a window's one step falls short of large ones
+    rest_covariance = max((scattered(along[:, None], weight, one[:, None]) for one in left.T), key=np.trace)
+    rest_covariance = rest_covariance + between**2 * np.diag([0, 1, 1])  # a shift of all is the turn's
+    normal = np.einsum("n,nki,nkj->ij", weight, turn[good], turn[good])
+    widest = np.linalg.inv(normal) + (SYSTEMATIC_PX * step / camera.fx) ** 2 * np.eye(3)
+    return Registration(rotation, covariance, rest * step, rest_covariance * step**2, {
         "windows": int(good.sum()), "textured": textured, "scatter_px": float(noise * step),
-        "shift_px": float(np.sqrt((moved**2).mean())), "shift_max_px": float(moved.max()),
-        "chi2": float(rotation @ np.linalg.solve(covariance, rotation)),
+        "shift_px": float(np.sqrt((moved**2).mean())) * step, "shift_max_px": float(moved.max()) * step,
+        "chi2": float(rotation @ np.linalg.solve(widest, rotation)),
     })  # fmt: skip
+
+
+def scattered(design: np.ndarray, weight: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Covariance (P, P) of a weighted least squares fit from what it leaves (N, K), whatever the weights meant.
+
+    ``design`` (N, K, P), ``weight`` (N,). White 1980 (heteroskedasticity-consistent), times N / (N - P) for few.
+    """
+    inverse = np.linalg.inv(np.einsum("n,nki,nkj->ij", weight, design, design))
+    pull = np.einsum("n,nki,nk->ni", weight, design, left)
+    count, unknowns = pull.shape
+    found: np.ndarray = inverse @ (pull.T @ pull) @ inverse * count / max(count - unknowns, 1)
+    return (found + found.T) / 2
 
 
 def affine(px: np.ndarray, camera: Camera) -> np.ndarray:
