@@ -96,6 +96,9 @@ speed: trade  ## regenerate docs/speed.md and its picture from the trade of CAPT
 bench-ask: $(READY)  ## ask errors and a time of the desk, and say what was reached, for docs/benchmarks
 	@$(VENV)/bin/python -m benchmarks.ask
 
+bench-ladders: $(READY)  ## force each rung that desk does not climb: change against what was stated, for docs/benchmarks
+	@$(VENV)/bin/python -m benchmarks.ladders
+
 bench-render: $(READY)  ## measure the render at equal error, for docs/benchmarks (BENCH=--full for more)
 	@$(VENV)/bin/python -m benchmarks.render $(BENCH)
 
@@ -140,4 +143,4 @@ clean:  ## remove what was built
 	rm -rf build
 
 FORCE:
-.PHONY: bench-pose figures-hard accuracy extremes trade speed bench-budget bench-colour bench-render bench-zscore bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
+.PHONY: bench-ladders bench-pose figures-hard accuracy extremes trade speed bench-budget bench-colour bench-render bench-zscore bench-cycles-env bench-probe bench-skylibs-env simulate help setup demo all test test-all check docs figures verify lock clean FORCE
