@@ -60,6 +60,8 @@ WISHED = {**CUBE, "lift_m": 0.0, "scale": 1.0, "material": None}
 
 def test_a_truth_of_another_scene_gives_no_figures(everything, tmp_path):
     facts = with_truth(everything, tmp_path)
+    (remark,) = run(everything, facts=facts, wishes={"object": [WISHED]}).warnings
+    assert remark.startswith("truth.json: names no objects, so its picture is taken to show those of scene.toml")
     path = tmp_path / "truth.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"objects": [CUBE]}))
     same = run(everything, facts=facts, wishes={"object": [WISHED]})
@@ -70,6 +72,7 @@ def test_a_truth_of_another_scene_gives_no_figures(everything, tmp_path):
     assert lifted.outputs["error_map"].shape == (1, 1)
     assert lifted.numbers["other_scene"] == ["cube: lift_m is 0.1, there 0"]
     assert any(line.startswith("the truth shows another scene: no figures") for line in lifted.warnings)
+    assert not any("names no objects" in line for line in [*same.warnings, *lifted.warnings])
 
 
 def test_what_of_a_scene_differs_from_the_truths():

@@ -56,7 +56,7 @@ def settings(quality: str, switches: list[str]) -> Settings:
 
 
 def bench(root) -> Drawn:
-    judge = trade.judge_of(root, "final", None)
+    judge = trade.judge_of(root, None)
     return Drawn(graph(), root, lambda point: settings(point.quality, point.switches), judge, "source", {}, CODE)
 
 

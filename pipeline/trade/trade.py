@@ -7,13 +7,12 @@ Rows, pages and the list of what failed lie in ``trade/`` of the build folder; n
 from __future__ import annotations
 
 import functools
-import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.run.errors import ManifestError
 from pipeline.run.live import Stop
@@ -23,6 +22,9 @@ from pipeline.run.stage import Graph
 from pipeline.trade import front, page, scores
 from pipeline.trade.points import Changes, Point, combinations, singles
 from pipeline.trade.work import Bench, Row, alone, code_of, digest_of, error_of, source_of
+
+if TYPE_CHECKING:
+    from pipeline.image.truth import Truth
 
 PRESETS = ("draft", "preview", "final")
 REFERENCE = "final"  # stands in for the truth where there is none
@@ -130,18 +132,21 @@ def trade(asked: Asked, say: Say) -> None:
 
 def prepared(asked: Asked, root: Path, say: Say) -> tuple[str, Session, Point]:
     """What errors are against, the bench, and the base."""
+    from pipeline.image.truth import load_truth, other_scene
+    from pipeline.run.artifacts import WISHES
+
     settings = asked.settle(asked.base, [])
     build = Build(asked.graph, root / "source", settings, asked.models)
     against, (source, facts) = asked.against, source_of(build, asked.against)
-    truth = facts.get("truth_path")
-    if truth and (other := strange(Path(truth), build)):
+    truth = load_truth(Path(facts["truth_path"])) if facts.get("truth_path") else None
+    if truth is not None and (other := other_scene(truth.objects, build.value(WISHES)["object"])):
         if against == "truth":
             raise ManifestError(f"--against: is truth, which shows another scene ({'; '.join(other)}); take final")
         truth = None
-    if against == "truth" and not truth:
+    if against == "truth" and truth is None:
         raise ManifestError("--against: is truth; this capture names none; take final, or add truth to capture.toml")
     if not against:
-        against = "truth" if truth else REFERENCE
+        against = "truth" if truth is not None else REFERENCE
         source, _ = source_of(build, against)
     base = Point(f"{asked.base}", "base", asked.base)
 
@@ -149,33 +154,19 @@ def prepared(asked: Asked, root: Path, say: Say) -> tuple[str, Session, Point]:
     def settle(point: Point) -> Settings:
         return asked.settle(point.quality, point.switches)
 
-    bench = Bench(
-        asked.graph, root, settle, judge_of(root, against, truth), source, build.versions, code_of(asked.graph)
-    )
+    judge = judge_of(root, truth if against == "truth" else None)
+    bench = Bench(asked.graph, root, settle, judge, source, build.versions, code_of(asked.graph))
     bench.keep = frozenset(bench.keys(base).values())
     if asked.reuse:
         bench.adopt(asked.out, base)
     return against, Session(bench, say, asked.reuse), base
 
 
-def strange(truth: Path, build: Build) -> list[str]:
-    """What is wished otherwise than the truth's picture shows it."""
-    from pipeline.image.truth import other_scene
-    from pipeline.run.artifacts import WISHES
-
-    shown = json.loads(truth.read_bytes()).get("objects")
-    return other_scene(shown, build.value(WISHES)["object"]) if shown is not None else []
-
-
-def judge_of(root: Path, against: str, truth: str | None) -> Callable[[Path], dict[str, float | None]]:
-    """The figures of a finished build; the truth is read once, the reference build is the first that is judged."""
-    from pipeline.image.truth import Truth, load_truth
-
-    known: list[Truth] = []
+def judge_of(root: Path, truth: Truth | None) -> Callable[[Path], dict[str, float | None]]:
+    """The figures of a finished build; without truth the reference build is the first that is judged."""
+    known = [] if truth is None else [truth]
 
     def judge(build: Path) -> dict[str, float | None]:
-        if not known and against == "truth":
-            known.append(load_truth(Path(str(truth))))
         reference = root / "reference"
         if not known and not (reference / "composite" / "composite.exr").exists():
             for part in ("composite/composite.exr", "develop/photographs/plate.exr"):
