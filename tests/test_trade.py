@@ -1,214 +1,24 @@
-"""Speed against accuracy: front, designs and tables on made-up numbers; two points of the desk through the command."""
+"""Speed against accuracy: scores, the bench and the session on made-up stages; two points of the desk by command."""
 
 from __future__ import annotations
 
-import csv
-import itertools
 import json
 import shutil
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import DESK, command, copied, refused
+from made_up_trade import about
 
 from pipeline.image import metrics
 from pipeline.image.truth import Truth
-from pipeline.run.errors import ArtifactError, CaptureError, ManifestError, ToolError
+from pipeline.run.errors import ArtifactError, CaptureError, ToolError
 from pipeline.run.settings import Settings
-from pipeline.trade import front, page, points, scores, trade, work
+from pipeline.trade import front, page, scores, trade, work
 from pipeline.trade.points import Point
 from stages.knobs import KNOBS
 from stages.order import graph
-
-
-def row(label: str, kind: str, cpu: float, error: float | None, **changes) -> dict:
-    stage = {"seconds": cpu / 2, "cpu_seconds": cpu, "peak_mb": 500.0}
-    changes = {knob.replace("__", "."): value for knob, value in changes.items()}
-    return {
-        "label": label, "kind": kind, "quality": "preview", "changes": changes,
-        "errors": {"changed_rel_err": error, "object_rel_err": error, "shadow_change_err": None},
-        "cpu_seconds": cpu, "seconds": cpu / 2, "peak_mb": 500.0, "composite_mb": 9.0, "stages": {"render": stage},
-        "linked": [], "spent_seconds": cpu / 2,
-    }  # fmt: skip
-
-
-ROWS = [
-    row("seed 1", "repeat", 31.0, 0.020, render__seed=1),
-    row("seed 2", "repeat", 29.0, 0.022, render__seed=2),
-    row("preview", "base", 30.0, 0.021),
-    row("draft", "preset", 12.0, 0.050),
-    row("final", "preset", 150.0, 0.010),
-    row("render.samples=8", "knob", 15.0, 0.035, render__samples=8),
-    row("render.samples=4", "knob", 11.0, 0.060, render__samples=4),
-    row("render.samples=128", "knob", 60.0, 0.014, render__samples=128),
-    row("probe.width=512", "knob", 26.0, 0.024, probe__width=512),
-    row("composite.kind=ratio", "knob", 29.5, 0.0215, composite__kind="ratio"),
-    row("merge.weights=poisson", "knob", 31.0, None, merge__weights="poisson"),
-    {"label": "probe.width=64", "kind": "knob", "quality": "", "changes": {"probe.width": 64}, "failed": "no ball"},
-]
-
-
-def test_front_is_what_no_other_beats():
-    nan = float("nan")
-    chosen = [(1, 5), (2, 4), (2, 5), (3, 4), (4, 1), (5, 1), (nan, 0), (4, 1)]
-    assert front.pareto(chosen) == [True, True, False, False, True, False, False, True]
-
-
-def test_front_against_every_subset_of_random_points():
-    """By definition: a point is on the front if it is the best of all for some bound on the cost."""
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        found = [(float(c), float(e)) for c, e in rng.integers(0, 8, (12, 2))]
-        best = {min((p for p in found if p[0] <= bound), key=lambda p: (p[1], p[0])) for bound, _ in found}
-        assert {p for p, on in zip(found, front.pareto(found), strict=True) if on} == best
-
-
-@pytest.mark.parametrize("factors", range(1, points.MOST_FACTORS + 1))
-def test_designs_are_balanced_and_mix_no_main_effect_with_an_interaction_of_two(factors):
-    """Resolution IV, or all combinations: columns are orthogonal to each other and to products of two others."""
-    runs = 2 * np.array(points.design(factors), int) - 1
-    assert len({tuple(run) for run in runs}) == len(runs) == (2**factors if factors <= 3 else 8 if factors == 4 else 16)
-    assert not runs.sum(0).any()
-    assert (-1,) * factors in {tuple(run) for run in runs}  # the base itself, which is known
-    for i, j in itertools.combinations(range(factors), 2):
-        assert runs[:, i] @ runs[:, j] == 0
-        for k in set(range(factors)) - {i, j}:
-            assert runs[:, i] @ (runs[:, j] * runs[:, k]) == 0
-
-
-def test_designs_have_a_limit():
-    with pytest.raises(ValueError, match="9 factors"):
-        points.design(9)
-
-
-def test_ladders_hold_allowed_values_of_existing_knobs_and_their_defaults():
-    for knob, ladder in points.LADDERS.items():
-        stage, name = knob.split(".")
-        for value in ladder:
-            KNOBS[stage].model_validate({name: value})
-        assert KNOBS[stage].model_fields[name].default in ladder, knob
-        assert len(set(ladder)) == len(ladder) > 1
-
-
-def test_singles_leave_the_base_out():
-    base = {"render": {"samples": 48}, "composite": {"kind": "auto"}}
-    found = points.singles(base, "preview", ["render.samples", "composite.kind"])
-    assert [p.label for p in found] == [
-        *(f"render.samples={n}" for n in (2, 4, 8, 16, 128, 512)), "composite.kind=additive", "composite.kind=ratio",
-    ]  # fmt: skip
-    assert found[-1].switches == ["composite.kind=ratio"]
-    assert Point("", "", "", (("render.denoise", False),)).switches == ["render.denoise=false"]
-
-
-def test_a_source_of_the_pose_is_tried_only_where_there_are_further_views():
-    knobs = ["render.depth", "sources.cloud"]
-    assert points.without_effect(knobs, views=True) == {}
-    assert list(points.without_effect(knobs, views=False)) == ["sources.cloud"]
-
-
-def test_unknown_knobs_are_refused():
-    assert points.chosen_knobs(None) == list(points.LADDERS)
-    assert points.chosen_knobs("render.depth, merge.weights") == ["render.depth", "merge.weights"]
-    with pytest.raises(ManifestError, match=r"render\.speed"):
-        points.chosen_knobs("render.speed")
-
-
-def test_noise_is_the_spread_of_base_and_repeats():
-    sigma = front.noise(ROWS)
-    assert sigma["cpu_seconds"] == pytest.approx(1.0)
-    assert sigma["changed_rel_err"] == pytest.approx(1e-3)
-    assert sigma["shadow_change_err"] is None
-    assert front.noise(ROWS[2:])["cpu_seconds"] is None  # one run has no spread
-
-
-def test_a_point_is_beaten_by_what_is_cheaper_and_better_beyond_chance():
-    """Costs scatter by 1, errors by 0.001: two standard deviations of a difference are 2.8 and 0.0028."""
-    same = {"kind": "base", "label": "base", "cpu_seconds": 30.0, "errors": {"changed_rel_err": 0.02}}
-    rows = [row for row in ROWS if row["kind"] in ("base", "repeat")]
-    tried = {"both": (20.0, 0.010), "cost by chance": (28.0, 0.010), "error by chance": (20.0, 0.018)}
-    rows += [
-        same | {"kind": "knob", "label": label, "cpu_seconds": cost, "errors": {"changed_rel_err": error}}
-        for label, (cost, error) in tried.items()
-    ]
-    assert front.beaten_by(same, rows, "changed_rel_err") == ["both"]
-    assert front.beaten_by(same, rows, "object_rel_err") == []
-
-
-def test_what_a_knob_buys_is_against_the_base_and_says_what_may_be_chance():
-    """A difference of two runs has sqrt(2) of the spread: 2.8 CPU s and 0.0028 are two of its standard deviations."""
-    table = {(entry["knob"], entry["value"]): entry for entry in front.buys(ROWS)}
-    quick = table["render.samples", 8]
-    assert (quick["d_cpu_seconds"], quick["d_changed_rel_err"]) == (-15.0, pytest.approx(0.014))
-    assert not {"cpu_seconds", "changed_rel_err"} & set(quick["chance"])
-    assert {"cpu_seconds", "changed_rel_err"} <= set(table["composite.kind", "ratio"]["chance"])
-    assert "cpu_seconds" not in table["probe.width", 512]["chance"]
-    assert table["merge.weights", "poisson"]["d_changed_rel_err"] is None
-    assert ("probe.width", 64) not in table  # it failed
-
-
-def test_combinations_are_of_knobs_that_mattered():
-    """samples=4 saves more, at more than twice the error; the ratio saves within chance; what is known is not asked."""
-    assert front.savers(ROWS) == {"render.samples": 8, "probe.width": 512}
-    assert front.betterers(ROWS) == {"render.samples": 128}
-    tried = [tuple(sorted(r["changes"].items())) for r in ROWS if r["kind"] == "knob"]
-    (found,) = points.combinations(front.savers(ROWS), "preview", tried)
-    assert found.changes == (("probe.width", 512), ("render.samples", 8))
-    assert found.label == "probe.width=512 render.samples=8"
-    assert points.combinations({}, "preview") == []
-
-
-def test_combinations_are_foretold_from_knobs_alone():
-    """One stage: 30 s times a half times 26/30; errors by their squares."""
-    both = front.predicted({"render.samples": 8, "probe.width": 512}, ROWS)
-    assert both == {
-        "cpu_seconds": pytest.approx(30 * 15 / 30 * 26 / 30),
-        "changed_rel_err": pytest.approx(np.sqrt(0.035**2 + 0.024**2 - 0.021**2)),
-    }
-    assert front.predicted({}, ROWS) == {"cpu_seconds": 30.0, "changed_rel_err": pytest.approx(0.021)}
-    assert front.predicted({"render.depth": 2}, ROWS) is None  # not measured alone
-    assert front.predicted({"merge.weights": "poisson"}, ROWS) is None  # without a figure
-    combined = row("a b", "design", 14.0, 0.04, render__samples=8, probe__width=512)
-    assert page.combinations_table([*ROWS, combined])[-1] == "| `a b` | 14.0 | 13.0 | 0.0400 | 0.0369 |"
-    assert page.combinations_table(ROWS) == []
-
-
-def about() -> dict:
-    told = {"capture": "made_up", "against": "truth", "base": "preview", "cores": 2, "machine": "x86_64", "repeats": 2}
-    return {**told, "noise": front.noise(ROWS)}
-
-
-def test_pages_say_what_was_measured(tmp_path):
-    files = page.write(tmp_path, ROWS, about())
-    assert [file.name for file in files] == ["trade.json", "trade.csv", "trade.svg", "presets.json", "trade.md"]
-    record = json.loads(files[0].read_text())
-    told = json.loads(files[3].read_text())
-    assert set(told["presets"]) == {"draft", "preview", "final"}
-    assert told["presets"]["draft"]["cpu_seconds"] == 12.0
-    on_front = {entry["label"] for entry in record["points"] if entry["front"]["changed_rel_err"]}
-    assert on_front == {"render.samples=4", "draft", "render.samples=8", "probe.width=512", "composite.kind=ratio",
-                        "preview", "render.samples=128", "final"}  # fmt: skip
-    with files[1].open() as file:
-        table = {line["label"]: line for line in csv.DictReader(file)}
-    assert len(table) == len(ROWS)
-    assert float(table["draft"]["render_cpu_seconds"]) == 12.0
-    assert table["probe.width=64"]["failed"] == "no ball"
-    drawn = ET.parse(files[2]).getroot()
-    circles = [item for item in drawn if item.tag.endswith("circle") and len(item)]
-    assert len(circles) == len([r for r in ROWS if front.is_measured(r) and r["errors"]["changed_rel_err"]])
-    text = files[4].read_text()
-    assert "| `render.samples` | 8 | +0.0140 | +0.0140 | -15.0 | -7.5 | (+0) |" in text
-    assert "|  | 4 |" in text  # a knob is named once
-    assert "- `probe.width=64`: no ball" in text
-    assert "(3 runs): 1 CPU s" in text
-
-
-def test_a_page_without_repeats_says_so(tmp_path):
-    rows = ROWS[2:4]
-    text = page.markdown(page.flagged(rows), about() | {"noise": front.noise(rows)})
-    assert "no error bar is known" in text
-    assert "No knob was tried alone" in text
 
 
 def test_what_depends_on_a_changed_knob_has_another_key_and_nothing_else_has():
