@@ -128,9 +128,31 @@ def test_what_a_gloss_taken_for_matt_costs_grows_with_it_and_leaves_out_other_ma
         radiance = 0.4 * fields.scale[0] + fields.offset[0]
         radiance[others] *= 6  # paper on the plane
         cells = specular.Cells(radiance, 1e-6 * radiance**2, view, np.arange(60))
-        return specular.taken_for_matt(cells, LAMP, up, {"model": "rough", "roughness": 0.4, "f0": f0})
+        lobe = specular.Lobe.of(cells, LAMP, up, {"model": "rough", "roughness": 0.4, "f0": f0})
+        return specular.taken_for_matt(lobe, cells, up)
 
     costs = [cost(f0) for f0 in (0.01, 0.03, 0.09)]
     assert costs[0] < costs[1] < costs[2]
     assert costs[0] < 0.1
     assert cost(0.03, others=slice(0, None, 3)) < costs[1]
+
+
+def test_what_objects_feel_of_a_gloss_taken_for_matt():
+    """Nothing where a plane looks alike from everywhere; more of a stronger coat, and of a metal by far the most.
+
+    A white metal under an even sky is such a plane, but for what single scattering loses, 1 to 2 % at this roughness.
+    """
+    view = np.stack([np.sin(a := np.linspace(0.2, 1.2, 60)), np.cos(a), 0 * a], -1)
+    up = np.array([0.0, 1, 0])
+
+    def cost(light: np.ndarray, base: float, **model: float | str) -> float:
+        row = {"roughness": 0.4, **model}
+        bare = specular.Lobe(lights_of(light), up, row, np.zeros((0, 3)), np.zeros(0))
+        fields = bare.fields(bare.lights, view)[0]
+        radiance = base * fields.scale[0] + fields.offset[0]
+        cells = specular.Cells(radiance, 1e-6 * radiance**2, view, np.arange(60))
+        return specular.objects_of_matt(specular.Lobe.of(cells, light, up, row), cells, light, up)
+
+    assert cost(np.ones((64, 128, 3)), 1.0, model="metallic", roughness=0.3) < 0.02
+    coats = [cost(LAMP, 0.4, model="rough", f0=f0) for f0 in (0.02, 0.12)]
+    assert 0 < coats[0] < coats[1] < cost(LAMP, 0.4, model="metallic") / 2

@@ -120,11 +120,11 @@ def irradiance_errors(
 
 def error_on_objects(rgb: np.ndarray, depth: Depth, source: np.ndarray, target: np.ndarray, eye: np.ndarray) -> float:
     """Mean of these errors, unmoved, over what a ball at ``target`` shows a camera at ``eye`` (3,), by size there."""
-    normals, seen = _facing(eye - target)
+    normals, seen = facing(eye - target)
     return float(irradiance_errors(rgb, depth, source, source, target, normals) @ seen)
 
 
-def _facing(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def facing(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (N, 3) that a ball shows from direction ``way`` (3,), and shares (N,) of its picture; evenly spread.
 
     A spiral over the sphere (Swinbank and Purser 2006, Fibonacci grids), of which half is seen.

@@ -15,11 +15,14 @@ blocks are large so that it has to be predicted from afar, and a rung must win b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pipeline.conventions import latlong_directions
+from pipeline.light.environment import irradiance, resize_environment
+from pipeline.light.near_field import facing
 from pipeline.run.evidence import TRIED
 from pipeline.transport.patches import Lights, lights_of, upper
 from pipeline.transport.reflectance import linear
@@ -42,6 +45,7 @@ MIN_CELLS = 48
 MIN_GAIN = 5.0  # nats over all held-out cells
 MIN_SIGMAS = 2.5  # of the sum over blocks
 HIGHEST_BASE = 1.1
+OBJECT_ROWS = 24  # of the map by which light on objects is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,32 +200,57 @@ def climb(cells: Cells, environment: np.ndarray, normal: np.ndarray, gloss: str 
         taken = max((1, 2), key=lambda number: rows[number]["held_out"])
     asked = rows[taken or 1]
     if np.isfinite(asked["gain"]):
-        asked["taken_for_matt"] = taken_for_matt(cells, environment, normal, asked)
+        lobe = Lobe.of(cells, environment, normal, asked)
+        asked["taken_for_matt"] = taken_for_matt(lobe, cells, normal)
+        asked["objects_of_matt"] = objects_of_matt(lobe, cells, environment, normal)
     model: dict[str, Any] = {key: value for key, value in rows[taken].items() if key in Surface.model_fields}
     if taken:
         model |= refined(cells, environment, normal, model)
     return Surface(**model, scores=[{**row, "cells": len(fold)} for row in rows])
 
 
-def taken_for_matt(cells: Cells, environment: np.ndarray, normal: np.ndarray, model: dict[str, Any]) -> float:
+@dataclass(frozen=True, eq=False)
+class Lobe:
+    """A glossy rung on its cells: their ``base`` (N, 3), and by how much each counts, ``weight`` (N,) in [0, 1].
+
+    The weight is that of the t distribution of bases, so that what is of another material has little say.
+    """
+
+    lights: Lights
+    normal: np.ndarray
+    model: dict[str, Any]
+    base: np.ndarray
+    weight: np.ndarray
+
+    @staticmethod
+    def of(cells: Cells, environment: np.ndarray, normal: np.ndarray, model: dict[str, Any]) -> Lobe:
+        """Of a row of scores, under a map (H, W, 3)."""
+        empty = np.zeros((0, 3))
+        bare = Lobe(lights_of(environment), normal, model, empty, empty)
+        whole, _ = bare.fields(bare.lights, cells.view)
+        scale = np.maximum(whole.scale, 1e-12)
+        base = (cells.radiance - whole.offset) / scale
+        mean, scatter = fitted(base, cells.noise / scale**2)
+        weight = np.minimum((FREEDOM + 3) / (FREEDOM + _distance(base - mean[:, None], scatter)[0]), 1.0)
+        return replace(bare, base=np.maximum(base[0], 0), weight=weight)
+
+    def fields(self, lights: Lights, view: np.ndarray) -> tuple[Fields, np.ndarray]:
+        """W and S (1, N, 3) towards ``view`` (N, 3) under some lights, and their irradiance (N, 3)."""
+        found = lobes(lights, self.normal, view, np.array([self.model["roughness"]]))
+        if self.model["model"] == "metallic":
+            return metal(found), found.e
+        return rough(found, np.array([self.model["f0"]])), found.e
+
+
+def taken_for_matt(lobe: Lobe, cells: Cells, normal: np.ndarray) -> float:
     """By how much shadows would be wrong if a glossy plane were taken for a matt one: a share of their change, median.
 
     From each of AZIMUTHS sides a thing hides a cap of the sky. The glossy plane loses ``base dW + dS`` of its radiance
-    L there, the matt one ``L dE / E``. Pooled are all cells and sides where that changes L by more than SHADOW; a cell
-    counts by its weight in the t distribution of bases, so that what is of another material has little say.
+    L there, the matt one ``L dE / E``. Pooled are all cells and sides where that changes L by more than SHADOW, a cell
+    by its weight.
     """
-    lights = lights_of(environment)
-    roughness, f0 = np.array([model["roughness"]]), np.array([model.get("f0", F0[0])])
-
-    def fields(part: Lights) -> tuple[Fields, np.ndarray]:
-        found = lobes(part, normal, cells.view, roughness)
-        return metal(found) if model["model"] == "metallic" else rough(found, f0), found.e
-
-    whole, light = fields(lights)
-    scale = np.maximum(whole.scale, 1e-12)
-    base = (cells.radiance - whole.offset) / scale
-    mean, scatter = fitted(base, cells.noise / scale**2)
-    ours = np.minimum((FREEDOM + 3) / (FREEDOM + _distance(base - mean[:, None], scatter)[0]), 1.0)
+    lights = lobe.lights
+    light = lobe.fields(lights, cells.view)[1]
     level = np.linalg.norm(cells.radiance, axis=1)
     elevation, half = np.radians(HIDDEN_DEG)
     side, other = _across(normal)
@@ -230,14 +259,34 @@ def taken_for_matt(cells: Cells, environment: np.ndarray, normal: np.ndarray, mo
         flat = np.cos(azimuth) * side + np.sin(azimuth) * other
         way = np.cos(elevation) * flat + np.sin(elevation) * normal
         hidden = lights.direction @ way > np.cos(half)
-        lost, dark = fields(Lights(lights.direction[hidden], lights.power[hidden]))
-        glossy = np.maximum(base[0], 0) * lost.scale[0] + lost.offset[0]
+        lost, dark = lobe.fields(Lights(lights.direction[hidden], lights.power[hidden]), cells.view)
+        glossy = lobe.base * lost.scale[0] + lost.offset[0]
         matt = cells.radiance * dark / np.maximum(light, 1e-12)
         change = np.linalg.norm(glossy, axis=1)
         counts = change > SHADOW * level
-        wrong.append((ours * np.linalg.norm(matt - glossy, axis=1))[counts] / change[counts])
+        wrong.append((lobe.weight * np.linalg.norm(matt - glossy, axis=1))[counts] / change[counts])
     pooled = np.concatenate(wrong)
     return float(np.median(pooled)) if len(pooled) else 0.0
+
+
+def objects_of_matt(lobe: Lobe, cells: Cells, environment: np.ndarray, normal: np.ndarray) -> float:
+    """By how much the light on diffuse objects would be wrong, if a glossy plane were taken for a matt one: a median.
+
+    The matt plane sends every way what it sends the camera, the mean of the cells; the glossy one ``base W + S`` of the
+    mean base. Compared is the irradiance on what a ball shows the camera, without the shadow of the ball.
+    """
+    small = resize_environment(environment, OBJECT_ROWS, 2 * OBJECT_ROWS)
+    ways = latlong_directions(*small.shape[:2])
+    below = ways @ normal < 0
+    towards = lobe.fields(lights_of(environment, FINE_MAP), -ways[below])[0]  # finer lobes at grazing angles
+    base, matt = (np.average(values, axis=0, weights=lobe.weight) for values in (lobe.base, cells.radiance))
+    small[below] = base * towards.scale[0] + towards.offset[0]
+    wrong = np.zeros(small.shape)
+    wrong[below] = matt - small[below]
+    normals, seen = facing(cells.view.mean(0))
+    share = np.linalg.norm(irradiance(wrong, normals), axis=1) / np.linalg.norm(irradiance(small, normals), axis=1)
+    order = np.argsort(share)
+    return float(share[order][np.searchsorted(np.cumsum(seen[order]), 0.5)])
 
 
 def _across(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -343,14 +392,20 @@ def explain(surface: Surface, gloss: str = "auto") -> dict[str, Any]:
         if "gain" in row
     )
     modelled = surface.model != "diffuse"
-    wrong = next((row["taken_for_matt"] for row in surface.scores if "taken_for_matt" in row), None)
+    asked: dict[str, Any] = next((row for row in surface.scores if "taken_for_matt" in row), {})
+    wrong = asked.get("taken_for_matt")
     cost = "mirror images of the objects in the ground, and shadows that lie differently on a gloss"
     if wrong is not None:
-        cost += f": {wrong:.1%} of their change" + ("" if modelled else ", if the likeliest gloss were there")
+        cost += f": {wrong:.1%} of their change, {asked['objects_of_matt']:.1%} of the light on objects (medians)"
+        cost += "" if modelled else ", if the likeliest gloss were there"
     return {
         "term": "specular lobe of the ground",
         "modelled": modelled,
         "because": forced + (f"held-out log-likelihood: {scores}" if scores else surface.scores[0]["because"]),
         "could_cost": cost,
-        **({"no_bound": "no gloss was tried"} if wrong is None else {"bound_rel": wrong, **TRIED}),
+        **(
+            {"no_bound": "no gloss was tried"}
+            if wrong is None
+            else {"bound_rel": wrong, "object_rel": asked["objects_of_matt"], **TRIED}
+        ),
     }
