@@ -138,7 +138,7 @@ def test_what_a_gloss_taken_for_matt_costs_grows_with_it_and_leaves_out_other_ma
 
 
 def test_what_objects_feel_of_a_gloss_taken_for_matt():
-    """Nothing where a plane looks alike from everywhere; more of a stronger coat, and of a metal by far the most.
+    """Nothing where a plane looks alike from everywhere; more of a stronger coat, and of a metal the most.
 
     A white metal under an even sky is such a plane, but for what single scattering loses, 1 to 2 % at this roughness.
     """
@@ -155,4 +155,4 @@ def test_what_objects_feel_of_a_gloss_taken_for_matt():
 
     assert cost(np.ones((64, 128, 3)), 1.0, model="metallic", roughness=0.3) < 0.02
     coats = [cost(LAMP, 0.4, model="rough", f0=f0) for f0 in (0.02, 0.12)]
-    assert 0 < coats[0] < coats[1] < cost(LAMP, 0.4, model="metallic") / 2
+    assert 0.01 < coats[0] < coats[1] < cost(LAMP, 0.4, model="metallic")
