@@ -117,14 +117,14 @@ def evidence(
         {
             "term": "bright patch apart from the sky",
             "modelled": False,
-            "because": f"{name(patch)}, wider than {params.max_half_angle_deg:g}",
+            "because": f"{name(patch)}, wider than {params.max_half_angle_deg:g}: knob lights.max_half_angle_deg",
             "could_cost": "nothing: its shadow is soft, and the sky is sampled by brightness",
             "bound_rel": 0.0,
         }
         for patch in wide
     ]
     if not rows:
-        because = f"no narrow patch that stands out holds {params.min_share:.1%} of the light"
+        because = f"no narrow patch that stands out holds {params.min_share:.1%} of the light, knob lights.min_share"
         rows.append({
             "term": "lights apart from the sky", "modelled": False, "because": because, "could_cost": "nothing",
             "bound_rel": 0.0, **TRIED,

@@ -99,7 +99,11 @@ def compute(
     if shown is not None:
         height = max(map(abs, shown["height_m"].values())) + 2 * shown["uneven_m"]
         uneven_px = moved_by_height(height, list(spots.values()), view, camera, emitters)
-    terms = [*evidence(view, shown, uneven_px), extent_evidence(extent), beside_evidence(proxies, rows)]
+    terms = [
+        *evidence(view, shown, uneven_px),
+        extent_evidence(extent, params.left_out),
+        beside_evidence(proxies, rows),
+    ]
     return Result({"plane": plane, "surroundings": surroundings}, numbers, warnings, terms)
 
 
@@ -319,13 +323,14 @@ def evidence(view: View, cloud: dict[str, Any] | None = None, uneven_px: float =
     ]  # fmt: skip
 
 
-def extent_evidence(extent: dict[str, Any]) -> dict[str, Any]:
-    """Why the rectangle is as large as it is."""
+def extent_evidence(extent: dict[str, Any], left_out: float) -> dict[str, Any]:
+    """Why the rectangle is as large as it is: at its end objects change the light by less than ``left_out``."""
     if not extent["reach_m"]:
         because = f"no objects: {BARE:g} marker sizes around it"
     else:
         reaches = ", ".join(f"{name} {reach:.2f} m" for name, reach in extent["reach_m"].items())
-        because = f"by bounding spheres under the map objects change the plane within {reaches}"
+        because = "by bounding spheres under the map objects change the plane by more than knob plane.left_out = "
+        because += f"{left_out:g} within {reaches}"
     return {
         "term": "plane beyond the rectangle", "modelled": False, "because": because,
         "could_cost": f"at most {extent['left_out_bound']:.2%} of the light at its border in the frame, more where a "

@@ -140,7 +140,7 @@ def test_the_ball_on_lacquer_is_found_by_the_print_beside_it(lacquer_build):
 
 @pytest.mark.slow
 def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
-    """Forced to a diffuse ground. Predicted: 32 % of the shadows' change.
+    """Forced to a diffuse ground. Predicted: 32 % of the shadows' change, 8 % of the light on objects (medians).
 
     Measured: error of the shadows' change 0.062 -> 0.241, on the objects 0.050 -> 0.083; they mirror the
     ground, of which the plate shows what it is.
@@ -149,12 +149,14 @@ def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
 
     matt = Surface(scores=[{"model": "diffuse", "because": "forced"}])
     monkeypatch.setattr(reflectance, "climb", lambda *_: matt)
-    predicted = evidence_of(lacquer_build, "reflectance", "specular lobe of the ground")["bound_rel"]
+    row = evidence_of(lacquer_build, "reflectance", "specular lobe of the ground")
+    predicted = row["bound_rel"]
     before = json.loads((lacquer_build / "evaluate/metrics.json").read_text())
     after = forced(lacquer_build, "plane", lambda values: values["plane"], monkeypatch)
     assert predicted > 0.2
     assert after["shadow_change_err"] - before["shadow_change_err"] > predicted / 2
-    assert after["object_rel_err"] > 1.3 * before["object_rel_err"]
+    added = np.sqrt(after["object_rel_err"] ** 2 - before["object_rel_err"] ** 2)  # errors add as squares
+    assert row["object_rel"] / 2 < added < 2 * row["object_rel"]
 
 
 # ---------------------------------------------------------------- cellar: lamps nearby, a shaking hand, labels that lie

@@ -16,6 +16,7 @@ from typing import Any
 from pipeline.run.errors import ArtifactError
 from pipeline.run.evidence import BOUNDS, is_open
 from pipeline.run.runner import Build, is_complete
+from pipeline.trade.points import LADDERS
 
 NAMED = re.compile(r"\bknob ([a-z]+\.[a-z_]+)")
 MARKS = {True: "+", False: "-"}  # anything else that `modelled` says is a part: "~"
@@ -26,9 +27,9 @@ def needs(build: Build) -> dict[str, Any]:
 
     ``stages``: [{stage, seconds, cpu_seconds, stale, terms: [{term, modelled, because, could_cost}]}]; ``stale`` is
     empty, or says why the record no longer holds. A term that was not modelled, or in part, also has ``saved_s``
-    [CPU s] and ``saved_by``, how that is known; ``bound_rel``, ``bound_px`` and ``bound_deg``, each None where it is
-    not stated, and ``no_bound``, why. ``left_out``: how many those are, and over those that are known the sum of the
-    seconds, and of the bounds (and of their squares, rooted).
+    [CPU s] and ``saved_by``, how that is or can be known; ``bound_rel``, ``bound_px`` and ``bound_deg``, each None
+    where it is not stated, and ``no_bound``, why. ``left_out``: how many those are, and over those that are known the
+    sum of the seconds, and of the bounds (and of their squares, rooted).
 
     Raises ArtifactError when a stage has not run.
     """
@@ -68,9 +69,11 @@ def told(entry: dict[str, Any], bought: dict[str, float], cpu_seconds: float | N
         saved, by = entry.get("saved_s"), entry.get("saved_by", "")
     if saved is None and cpu_seconds is not None and "saved_rel" in entry:
         saved = cpu_seconds * entry["saved_rel"]
+    if saved is None:
+        by = f"insitu trade --knobs {knob[1]} measures it" if knob and knob[1] in LADDERS else ""
     bounds = {name: entry.get(name) for name in BOUNDS}
     return {
-        **term, "saved_s": saved, "saved_by": "" if saved is None else by, **bounds,
+        **term, "saved_s": saved, "saved_by": by, **bounds,
         "no_bound": entry.get("no_bound", ""),
     }  # fmt: skip
 
@@ -143,7 +146,7 @@ def as_text(found: dict[str, Any], build: Build) -> str:
             lines += wrapped("because", term["because"]) + wrapped("could cost", term["could_cost"])
             if "saved_s" in term:
                 saved, by = term["saved_s"], f" ({term['saved_by']})" if term["saved_by"] else ""
-                lines += wrapped("saved", "-" if saved is None else f"{saved:.1f} CPU s{by}")
+                lines += wrapped("saved", f"{'-' if saved is None else f'{saved:.1f} CPU s'}{by}")
                 lines += wrapped("bound", bound_text(term))
     terms = [term for stage in found["stages"] for term in stage["terms"]]
     counts = [sum(term["modelled"] is state for term in terms) for state in (True, False)]
