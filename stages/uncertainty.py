@@ -81,13 +81,14 @@ def compute(
         numbers = {"step_px": grid.step, "traced_px": int(grid.chosen.sum()), "followed": [p.name for p in followed]}
         evidence = reasons(followed, left, params.share)
     picture = composite.rgb()
-    variance = pixels.total_variance(list(own.values()), modes, window)
+    typical = pixels.of_intervals(own)
+    variance = pixels.total_variance(list(typical.values()), modes, window)
     fall = pixels.waterfall(picture, plate.rgb(), composite["obj.A"], own, means, modes, window)
     unknown = int((~np.isfinite(variance)).any(-1).sum())
     numbers |= {"unknown_px": unknown, "modes": {mode.name: mode.source for mode in modes}}
     numbers |= {f"{region}_sigma_rel": part["pixel_rel"]["total"] for region, part in fall.items()}
     numbers |= {f"{region}_mean_sigma_rel": part["mean_rel"]["total"] for region, part in fall.items()}
-    parts = {"sigma": np.sqrt(variance), **{name: np.sqrt(part) for name, part in own.items()}}
+    parts = {"sigma": np.sqrt(variance), **{name: np.sqrt(part) for name, part in typical.items()}}
     parts["of_means"] = np.sqrt(pixels.of_means(shown, sampled))
     level = float(np.median(plate.rgb()))
     channels: dict[str, np.ndarray] = {}

@@ -22,7 +22,7 @@ from pipeline.probes.sphere_fit import Height, SphereFit
 from pipeline.types import Camera, Raster, View
 
 RADIUS, CONTRAST, RADIANCE = 0.04, 0.4, 300.0
-BLUR_PX = 0.47  # of a lens besides the pixel's box: 0.55 px together, as the bundled captures have it
+BLUR_PX = 0.58  # of a lens besides the pixel's box: 0.65 px together
 
 
 def map_of(rgb: np.ndarray, sigma: np.ndarray | float, attributes: dict, **channels: np.ndarray) -> Raster:
@@ -155,15 +155,15 @@ def errors(radius_px: int, half_angle_deg: float, method: Method, seeds: int = 2
 
 @pytest.mark.parametrize(("radius_px", "half_angle_deg"), [(60, 4.0), (120, 2.0)])
 def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg):
-    """Lamps of 20 pixels, lens and pixel 0.55 px together, at the sharper end of what the law is the mean of.
+    """Lamps of 20 pixels, lens and pixel 0.65 px together, in the middle of what the law is for.
 
-    Measured over 21 lamps each, rms of error over sigma: 0.79 (60 px, 2 degrees), 0.90 (60, 4), 0.93 (120, 2), 0.78
-    (120, 4). Here 14 lamps of 3 channels, of which red and blue err together: 28 independent numbers, so that an rms
-    of 0.9 scatters by 0.9 / sqrt(56) = 0.12. Outside 0.55 to 1.25 sigma is wrong by a third.
+    Measured over 14 lamps each, rms of error over sigma: 0.76 and 0.76; over the law's own 456 lamps at this softness
+    1.1 (`benchmarks.sampled_lamps`). Red and blue err together, so 28 independent numbers: an rms scatters by a factor
+    of 1 / sqrt(56) = 0.13, twice as much for tails as heavy as these. 0.8 less two of them, 1.1 and two more.
     """
     z = errors(radius_px, half_angle_deg, "bilinear")
     assert len(z) >= 10
-    assert 0.55 < np.sqrt((z**2).mean()) < 1.25
+    assert 0.4 < np.sqrt((z**2).mean()) < 1.6
     assert (np.abs(z) < 2).mean() > 0.9
 
 
