@@ -373,7 +373,7 @@ def measured_noise(
 
 
 def surface_truth(studio: Studio, out: Path, pose: np.ndarray, progress: Callable[[str], None]) -> None:
-    """Write albedo.exr (as the plate's camera sees it) and environment.exr (at the ball's centre)."""
+    """Write albedo.exr (as the plate's camera sees it), environment.exr (at the ball's centre), and light elsewhere."""
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
     progress("albedo and environment")
     prints = not scene.bare_plate
@@ -381,13 +381,12 @@ def surface_truth(studio: Studio, out: Path, pose: np.ndarray, progress: Callabl
     albedo = surface_albedo(studio.mi, place.load(prints=prints), list(surfaces.values()))
     pixels = blur(studio.photograph(albedo, pose, sampling.pass_samples, 60_000), scene.camera.blur_sigma_px)
     capture.write_picture(out / "truth" / "albedo.exr", pixels[..., :3], {"seen": pixels[..., 3]}, "1")
-    height, width = sampling.environment_width // 2, sampling.environment_width
-    shoot = latlong_rays(studio.mi, place.ball_centre, width, height)
     measure = studio.radiance(place.photographer(pose))
-    light = picture(
-        studio.mi, shoot, measure, (height, width), sampling.environment, sampling.pass_samples, 70_000
-    )  # fmt: skip
-    capture.write_picture(out / "truth" / "environment.exr", with_small_lamps(scene.light, light))
+    height, width = sampling.environment_width // 2, sampling.environment_width
+    for name, at in {"environment": place.ball_centre, **capture.other_places(scene, place.ball_centre)}.items():
+        shoot = latlong_rays(studio.mi, at, width, height)
+        light = picture(studio.mi, shoot, measure, (height, width), sampling.environment, sampling.pass_samples, 70_000)
+        capture.write_picture(out / "truth" / f"{name}.exr", with_small_lamps(scene.light, light))
 
 
 def box_mean(values: np.ndarray, half: int = 2) -> np.ndarray:

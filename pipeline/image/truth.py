@@ -8,6 +8,7 @@ Read from a ``truth.json`` (only `stages/evaluate.py` opens it, after everything
     coverage    EXR with one float channel per object, or PNG whose R, G, B are ``coverage_names``
     albedo      EXR, optional: R G B and ``seen``, of the plane as the plate camera sees it, or PNG ``albedo_seen``
     environment {"file", "world_from_map"}: lat-long, formula of conventions; 3x3 rotation of its directions to world
+    elsewhere   [{"file", "at_m"}], optional: such maps of other places [m, world], under light that is not distant
     camera      {width height fx fy cx cy distortion}, first pixel centre (0.5, 0.5)
     views       {name: {"world_from_camera": 4x4}}
     objects     what ``with_objects`` shows, optional: [{name sha256 position_m yaw_deg lift_m scale}], as scene.toml
@@ -50,6 +51,7 @@ class Truth:
     albedo: np.ndarray | None = None  # (H, W, 4): RGB and seen
     environment: np.ndarray | None = None  # (h, w, 3)
     world_from_map: np.ndarray = field(default_factory=lambda: np.eye(3))
+    elsewhere: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)  # places (3,), world, and maps there
     camera: dict[str, Any] = field(default_factory=dict)
     views: dict[str, np.ndarray] = field(default_factory=dict)  # (4, 4) world_from_camera
     objects: list[dict[str, Any]] | None = None  # what with_objects shows; None: nobody says
@@ -83,6 +85,7 @@ def load_truth(path: Path) -> Truth:
         albedo=_albedo(folder, facts, space) if facts.get("albedo") else None,
         environment=picture(light["file"]) if light else None,
         world_from_map=np.asarray(light.get("world_from_map", np.eye(3)) if light else np.eye(3), float),
+        elsewhere=[(np.asarray(one["at_m"], float), picture(one["file"])) for one in facts.get("elsewhere", [])],
         camera=facts.get("camera", {}),
         views={n: np.asarray(v["world_from_camera"], float) for n, v in facts.get("views", {}).items()},
         objects=facts.get("objects"),

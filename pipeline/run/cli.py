@@ -132,7 +132,12 @@ def _scoring(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--probe", type=Path, help="score this lat-long EXR too")
     sub.add_argument("--capture", dest="capture_option", type=Path, help="the capture, instead of the argument")
     sub.add_argument(
-        "--with-truth", metavar="NAMES", help="put truth in place of camera,pose,probe,albedo: where error is"
+        "--with-truth", metavar="NAMES", help="put truth in place of camera,pose,probe,albedo,places: where error is"
+    )
+    sub.add_argument(
+        "--without",
+        metavar="TERMS",
+        help="force off alignment,exposures,near_field,gloss,texture,bounces: what they save",
     )
 
 
@@ -406,11 +411,13 @@ def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
     """Verbs that compute."""
     from pipeline.run.derive import print_summary, unfinished
 
-    if getattr(args, "with_truth", None):
+    if getattr(args, "with_truth", None) or getattr(args, "without", None):
         from pipeline.run.substitution import FIGURES, waterfall
 
-        say(f"{'truth in place of':<32}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
-        found = waterfall(build, [name.strip() for name in args.with_truth.split(",")], say)
+        say(f"{'truth in place of':<40}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
+        given = (args.with_truth, args.without)
+        names, terms = ([name.strip() for name in (text or "").split(",") if name] for text in given)
+        found = waterfall(build, names, say, terms)
         build.keep_waterfall(found)
         build.run(build.graph["report"])  # it shows the waterfall
         return 0

@@ -89,7 +89,9 @@ def page(folders: list[Path], cores: int, stages: tuple[str, ...]) -> str:
 def _waterfall(build: dict[str, Any]) -> list[str]:
     keys = list(build["waterfall"]["nothing"])
     lines = ["", f"## Where the error comes from: {build['name']}, {build['quality']}", ""]
-    lines += ["The truth put in place of what a stage estimated (`insitu evaluate --with-truth`).", ""]
+    terms = any(label.startswith("without ") for label in build["waterfall"])
+    off = ", and the error when a term of the model is forced off (`--without`)" if terms else ""
+    lines += [f"The truth put in place of what a stage estimated (`insitu evaluate --with-truth`){off}.", ""]
     lines += [
         "| truth in place of | " + " | ".join(COLUMNS[key] for key in keys) + " |",
         "|---" * (len(keys) + 1) + "|",

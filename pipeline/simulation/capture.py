@@ -250,11 +250,24 @@ def shown_objects(scene: SimulatedScene, out: Path) -> list[dict[str, Any]]:
     ]
 
 
+def other_places(scene: SimulatedScene, ball_centre: np.ndarray) -> dict[str, np.ndarray]:
+    """Where else the light is told, (3,) world by name of its map: at every object and amid them, as high as the ball.
+
+    Nowhere under a distant light, which is the same everywhere.
+    """
+    if scene.room is None or not scene.object:
+        return {}
+    each = [np.array([model.position_m[0], ball_centre[1], model.position_m[1]]) for model in scene.object]
+    middle = {"environment_amid": np.mean(each, 0)} if len(each) > 1 else {}
+    return middle | {f"environment_{model.name}": at for model, at in zip(scene.object, each, strict=True)}
+
+
 def truth_record(
     scene: SimulatedScene, shoot: Shoot, views: dict[str, np.ndarray], ball_centre: np.ndarray, noise: dict[str, float]
 ) -> dict[str, Any]:
     """What truth.json says."""
     camera, sensor = scene.camera, shoot.sensor
+    elsewhere = [{"file": f"{name}.exr", "at_m": at.tolist()} for name, at in other_places(scene, ball_centre).items()]
     _, hot = sensor.fixed_pattern(camera.height, camera.width)
     return {
         "unit": UNIT,
@@ -265,6 +278,7 @@ def truth_record(
         "coverage": "coverage.exr",
         "albedo": "albedo.exr",
         "environment": {"file": "environment.exr", "world_from_map": np.eye(3).tolist()},
+        **({"elsewhere": elsewhere} if elsewhere else {}),
         "camera": {
             **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
             "distortion": list(camera.distortion),
