@@ -284,4 +284,4 @@ class Result:
     outputs: dict[str, Any]
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
-    evidence: list[dict[str, Any]] = field(default_factory=list)  # {"term", "modelled", "because", "could_cost"}
+    evidence: list[dict[str, Any]] = field(default_factory=list)  # rows of pipeline.run.evidence
