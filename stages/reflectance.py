@@ -20,6 +20,7 @@ from pipeline.conventions import ACESCG, CLIPPED
 from pipeline.light.environment import irradiance
 from pipeline.run import artifacts as A
 from pipeline.run.errors import NumericalError
+from pipeline.run.evidence import ABSENT, TRIED
 from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport.gradient import Fit, fit
@@ -186,6 +187,7 @@ def shadow_evidence(asked: list[str], found: Found) -> dict[str, Any]:
         "because": because,
         "could_cost": "soft shadows and shadows on fine texture are taken for albedo, which the ratio composite undoes",
         "no_bound": "an edge that is soft is not told from texture",
+        **(TRIED if asked else {}),
     }
 
 
@@ -213,7 +215,7 @@ def bounce_evidence(found: Estimate | None, ignored: float) -> dict[str, Any]:
     term = {"term": "inter-reflection of the local scene"}
     if found is None:
         because = "one convex plane: no point of it sees another, one step of equation 8 is exact"
-        return {**term, "modelled": False, "because": because, "could_cost": "nothing for a plane", "bound_rel": 0.0}
+        return {**term, "modelled": False, "because": because, "could_cost": "nothing for a plane", **ABSENT}
     contraction = f"spectral radius of rho F {found.spectral_radius:.2f}"
     if found.method == "gathered":
         because = f"{found.measured_share:.1%} of the bounced light is seen in the plate and gathered; {contraction}"

@@ -34,6 +34,7 @@ from pipeline.probes.shadow_flux import (
     unseen_lamp,
 )
 from pipeline.probes.witness import Witness
+from pipeline.run.evidence import ABSENT
 
 MOST = 6  # lamps solved for together
 UNKNOWN = 0.01  # of the plane's light: clipped light without an answer that leaves those of others open
@@ -47,7 +48,7 @@ WEAK = 0.5  # relative sigma of a flux from which on the bound says as much
 
 NOTHING = {
     "term": "flux of clipped lamps", "modelled": False, "because": "nothing is clipped in every frame",
-    "could_cost": "nothing", "bound_rel": 0.0,
+    "could_cost": "nothing", **ABSENT,
 }  # fmt: skip
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
 from pipeline.light.environment import resize_environment
+from pipeline.run.evidence import ABSENT
 
 TRIAL_ROWS = 64  # rows of the grid on which trials are made: texels of 2.8 degrees
 TURNS = 16  # trials about the vertical
@@ -224,5 +225,5 @@ def reason(figures: dict[str, float | int], error: Prior | None) -> dict[str, An
         cost = f"{figures['filled_light_sigma_rel']:.2%} of the light (1 sigma), a lamp hidden there apart{chance}"
     return {
         "term": "smooth prior where nobody saw", "modelled": error is not None, "because": because, "could_cost": cost,
-        "bound_rel": 2 * float(figures["filled_light_sigma_rel"]),
+        **(ABSENT if error is None else {"bound_rel": 2 * float(figures["filled_light_sigma_rel"])}),
     }  # fmt: skip

@@ -23,6 +23,7 @@ from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_d
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.combine import Below
 from pipeline.probes.filling import enlarge
+from pipeline.run.evidence import TRIED
 from pipeline.transport.patches import lights_of
 from pipeline.transport.specular import FINE_MAP, cells_of, climb, explain, lobes, metal, rough
 from pipeline.types import Camera, Surface
@@ -170,4 +171,5 @@ def reason(gloss: Gloss) -> dict[str, Any]:
         "could_cost": f"a lobe that is off by {LOBE_SIGMA:.0%}, which the variance has" if gloss.taken
         else "nothing on a matt ground; the light from below by what a gloss too faint to be found mirrors",
         "no_bound": "held-out cells do not tell it from none; the reflectance stage bounds what the plate shows of it",
+        **TRIED,
     }  # fmt: skip

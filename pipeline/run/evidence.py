@@ -20,6 +20,7 @@ from typing import Any
 
 BOUNDS = ("bound_rel", "bound_px", "bound_deg")
 TRIED: dict[str, Any] = {"saved_rel": 0.0, "saved_by": "it was tried, so nothing is"}  # to be told: not needed
+ABSENT: dict[str, Any] = {"bound_rel": 0.0, "saved_rel": 0.0, "saved_by": "there is nothing to model"}
 
 
 def is_open(row: Mapping[str, Any]) -> bool:
