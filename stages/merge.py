@@ -133,7 +133,7 @@ def merge_brackets(
     warnings += [*sensor.warnings, *exposures.warnings]
     profiles = colour_profiles(brackets, warnings)
     for view in brackets:
-        _warn_extremes(view, numbers[view], warnings)
+        _warn_extremes(view, numbers[view], bool(aligned[view][1]["modelled"]), warnings)
     patterns = _add_fixed_patterns(merged, views, frames, sensor)
     for view, pattern in patterns.items():
         numbers[view]["prnu"] = pattern.prnu if pattern.believed else 0.0
@@ -169,10 +169,11 @@ def _merge_views(
         taken = [photographs.exposed(i, sensor, exposures) for i in members]
         exposed, shift, said = alignment.align(taken, [frames[i].file for i in members], params.align)
         merged = radiometry.merge(exposed, params.weights, threads)
-        if any(one is not other for one, other in zip(exposed, taken, strict=True)):
+        moved = [one is not other for one, other in zip(exposed, taken, strict=True)]
+        if any(moved):
             said |= alignment.cost(merged.radiance, radiometry.merge(taken, params.weights, threads).radiance, shift)
             samples = [bracket_noise.sample_of(one.mosaic, frames[i]) for i, one in zip(members, exposed)]
-            found.moved |= dict(zip(members, bracket_noise.shown_by_all(samples), strict=True))
+            found.moved |= dict(zip(members, bracket_noise.shown_by_all(samples, moved), strict=True))
         found.aligned[view] = (shift or 0.0, said)
         found.listing[view] = [_exposure_row(frames[i], one, exposures, i) for i, one in zip(members, exposed)]
         if view != CHART_VIEW and not view.startswith(FLAT_VIEW):
@@ -365,7 +366,7 @@ def _stops(radiance: np.ndarray) -> float:
     return float(np.log2(high / low)) if low > 0 else 0.0
 
 
-def _warn_extremes(view: str, numbers: dict[str, Any], warnings: list[str]) -> None:
+def _warn_extremes(view: str, numbers: dict[str, Any], moved: bool, warnings: list[str]) -> None:
     if numbers["clipped_fraction"] > 0.5:
         share = f"{numbers['clipped_fraction']:.0%}"
         warnings.append(f"{view}: {share} of the pixels clip in every frame; add a shorter exposure")
@@ -375,7 +376,8 @@ def _warn_extremes(view: str, numbers: dict[str, Any], warnings: list[str]) -> N
     if numbers["dark_fraction"] > 0.5:
         warnings.append(f"{view}: {numbers['dark_fraction']:.0%} of the pixels lie below noise; add a longer exposure")
     if numbers["ghost_fraction"] > 0.01:
-        warnings.append(f"{view}: frames disagree in {numbers['ghost_fraction']:.1%} of the pixels; something moved")
+        why = "edges, by what whole cells leave of the shift, or something moved" if moved else "something moved"
+        warnings.append(f"{view}: frames disagree in {numbers['ghost_fraction']:.1%} of the pixels; {why}")
 
 
 def _exposure_row(frame: Frame, one: Exposed, exposures: Exposures, index: int) -> dict[str, Any]:
@@ -464,7 +466,7 @@ def _pattern_evidence(patterns: Mapping[str, FixedPattern]) -> dict[str, Any]:
         cost = "about 0.5 to 1 % of each bright photosite beyond the stated variance; state prnu in [[noise]]"
     return {
         "term": "fixed pattern (PRNU)", "modelled": bool(known), "because": because, "could_cost": cost,
-        "bound_rel": float(prnu),
+        "bound_rel": float(prnu), **(TRIED if patterns else {}),
     }  # fmt: skip
 
 

@@ -34,6 +34,7 @@ class Sample:
     block_mean: np.ndarray  # normalised
     block_top: np.ndarray
     block_side: int
+    moved: bool = False  # onto the others of its view: what whole cells leave of a shift looks like noise
 
     def signal(self) -> np.ndarray:
         """Normalised signal of the rows, float32."""
@@ -69,11 +70,11 @@ def sample_of(samples: np.ndarray, frame: Frame) -> Sample:
     return Sample(frame, rows, (mean - black) * scale, (top - black) * scale, side)
 
 
-def shown_by_all(samples: Sequence[Sample]) -> list[Sample]:
-    """Samples of frames that were moved by whole cells, their rows cut to the rectangle in which none is NaN."""
+def shown_by_all(samples: Sequence[Sample], moved: Sequence[bool]) -> list[Sample]:
+    """Samples of a view of which some were ``moved`` by whole cells, rows cut to the rectangle in which none is NaN."""
     shown = np.logical_and.reduce([np.isfinite(one.rows).reshape(*one.rows.shape[:2], -1).all(-1) for one in samples])
     lines, columns = shown.any(1), shown.any(0)
-    return [replace(one, rows=one.rows[lines][:, columns]) for one in samples]
+    return [replace(one, rows=one.rows[lines][:, columns], moved=was) for one, was in zip(samples, moved, strict=True)]
 
 
 def neighbours(views: Sequence[str]) -> list[tuple[int, int]]:
@@ -94,7 +95,7 @@ def sensor_of(
         groups.setdefault(_key(sample.frame), []).append(index)
     levels = {key: _clip_level([samples[i] for i in members]) for key, members in groups.items()}
     pairs = [_Pair.of(samples, levels, *pair) for pair in neighbours(views)]
-    measured = {key: _transfer([one for one in pairs if one and one.keys == (key, key)]) for key in groups}
+    measured = {key: _transfer(_still([one for one in pairs if one and one.keys == (key, key)])) for key in groups}
     chosen, stated = {}, {}
     for key, members in groups.items():
         frame = samples[members[0]].frame
@@ -156,6 +157,7 @@ class _Pair:
     ratio: float
     limit: float
     step: float
+    moved: bool
 
     @classmethod
     def of(cls, samples: Sequence[Sample], levels: Mapping[Key, np.ndarray], long: int, short: int) -> _Pair | None:
@@ -173,7 +175,8 @@ class _Pair:
         if found is None:
             found = exposure.measure_ratio(a.ravel(), b.ravel(), label, limit, rough)
         step = 1 / noise.steps(frames[0])
-        return None if found is None else cls(keys, a, b, float(np.exp(found[0])), limit, step)
+        moved = samples[long].moved or samples[short].moved
+        return None if found is None else cls(keys, a, b, float(np.exp(found[0])), limit, step, moved)
 
     def bins(self) -> list[photon_transfer.Bin]:
         """Photon-transfer bins in units of the longer frame's ISO."""
@@ -186,6 +189,11 @@ class _Pair:
     def linearity(self, model: Noise) -> linearity.Linearity:
         """How far the longer frame is proportional."""
         return linearity.compare(self.long, self.short, self.ratio, self.limit, model)
+
+
+def _still(pairs: list[_Pair]) -> list[_Pair]:
+    """Those of which no frame was moved; all, where there are none."""
+    return [one for one in pairs if not one.moved] or pairs
 
 
 def _transfer(pairs: Sequence[_Pair]) -> Noise | None:

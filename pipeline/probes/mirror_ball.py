@@ -385,7 +385,7 @@ def reasons(found: dict[str, Found]) -> list[dict[str, Any]]:
         {
             "term": "parallax of other near surfaces",
             "modelled": False,
-            "because": "the room's distances are not measured",
+            "because": "the mirror's points are taken for its middle; [room] serves the map at the objects, not this",
             "could_cost": "directions off by R over distance, radiance unbiased",
             "no_bound": "how far off they are is not known; what the objects feel of it is the near field's row",
         },
