@@ -17,6 +17,7 @@ from pipeline.image import page, pictures
 from pipeline.image.balance import balanced
 from pipeline.image.panels import PARTS, TARGETS, Build, ball_rows, checks, light_of
 from pipeline.run import artifacts as A
+from pipeline.run.evidence import bound_text, is_open
 from pipeline.run.stage import Stage
 from pipeline.types import Balance, BallFit, Bracket, Camera, Harmonics, Plane, Raster, Result, View
 from stages import knobs
@@ -106,6 +107,7 @@ def section(build: Build, name: str) -> dict[str, Any]:
         "numbers": fig.readings(record.get("numbers") or {}), "warnings": record.get("warnings") or [],
         "evidence": [
             {key: entry.get(key, "") for key in ("term", "modelled", "because", "could_cost")}
+            | {"bound": bound_text(entry) if is_open(entry) else ""}
             for entry in record.get("evidence") or []
         ],
         "params": fig.readings(record.get("params") or {}), **shown,

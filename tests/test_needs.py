@@ -34,9 +34,9 @@ def test_a_stage_says_seconds_and_bounds_itself():
 
 
 def test_bounds_are_printed_with_units_or_why_there_are_none():
-    term = {"bound_rel": None, "bound_px": None, "bound_deg": None, "no_bound": "nobody knows"}
-    assert needs.bound_text(term) == "none: nobody knows"
-    assert needs.bound_text(term | {"bound_rel": 0.3, "bound_deg": 1.0}) == "30.00%, 1.00 degrees"
+    term = {"bound_rel": None, "no_bound": "nobody knows"}
+    assert evidence.bound_text(term) == "none: nobody knows"
+    assert evidence.bound_text(term | {"bound_rel": 0.3, "bound_deg": 1.0}) == "30.00%, 1.00 degrees"
 
 
 def test_a_row_that_is_silent_about_its_cost_is_found():
@@ -108,7 +108,8 @@ def test_sums_are_over_what_is_known():
     assert "2.0 CPU s saved by 1" in line
 
 
-NOISE = 0.0025  # by which medians of a change of noise alone differ; three seeds: objects 1.32, 1.22, 1.26 %, shadows 0.58, 0.57, 0.59 %
+# How far apart medians of a change by noise lie; three seeds: objects 1.32, 1.22, 1.26 %, shadows 0.58, 0.57, 0.59 %
+NOISE = 0.0025
 
 
 @pytest.fixture(scope="module")

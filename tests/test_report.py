@@ -15,7 +15,10 @@ from tests import staged
 RECORD = {
     "numbers": {"rms_px": 0.21, "held": {"k1_rel": 0.0123}, "source": "charuco", "ok": True, "none": None},
     "warnings": ["the <shortest> frame is clipped"],
-    "evidence": [{"term": "k1", "modelled": True, "because": "held-out error", "could_cost": "0.1 px"}],
+    "evidence": [
+        {"term": "k1", "modelled": True, "because": "held-out error", "could_cost": "0.1 px"},
+        {"term": "k2", "modelled": False, "because": "no gain", "could_cost": "0.2 px", "bound_px": 0.21},
+    ],
     "seconds": 1.25,
     "params": {"width": 512},
     "versions": {"numpy": "2.0"},
@@ -185,3 +188,9 @@ def test_mask_bits_survive_reduction():
     mask = np.zeros((1000, 1200), np.uint32)
     mask[501, 701] = 8
     assert (panels.reduced_mask(mask) == 8).sum() == 1
+
+
+def test_what_was_left_out_stands_with_its_bound(inputs):
+    page = page_of(inputs)
+    assert "0.210 px" in page
+    assert page.count("no gain") == page.count("0.210 px")

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-BOUNDS = ("bound_rel", "bound_px", "bound_deg")
+BOUNDS = {"bound_rel": "{:.2%}", "bound_px": "{:.3f} px", "bound_deg": "{:.2f} degrees"}  # and how they are written
 TRIED: dict[str, Any] = {"saved_rel": 0.0, "saved_by": "it was tried, so nothing is"}  # to be told: not needed
 ABSENT: dict[str, Any] = {"bound_rel": 0.0, "saved_rel": 0.0, "saved_by": "there is nothing to model"}
 
@@ -43,6 +43,12 @@ def silent(rows: Iterable[Mapping[str, Any]]) -> list[str]:
         and not row.get("no_bound")
         and not any(0 <= row[name] < float("inf") for name in BOUNDS if row.get(name) is not None)
     ]
+
+
+def bound_text(row: Mapping[str, Any]) -> str:
+    """The bounds of a row with their units, or why it has none."""
+    known = [words.format(row[name]) for name, words in BOUNDS.items() if row.get(name) is not None]
+    return ", ".join(known) or f"none: {row.get('no_bound', '')}"
 
 
 def not_covered(records: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.run.errors import ArtifactError
-from pipeline.run.evidence import BOUNDS, is_open
+from pipeline.run.evidence import BOUNDS, bound_text, is_open
 from pipeline.run.runner import Build, is_complete
 from pipeline.trade.points import LADDERS
 
@@ -155,13 +155,6 @@ def as_text(found: dict[str, Any], build: Build) -> str:
     if any(stage["stale"] for stage in found["stages"]):
         lines.append(f"some of this is out of date; {how_to_run(build)} renews it")
     return "\n".join(lines)
-
-
-def bound_text(term: dict[str, Any]) -> str:
-    """The bounds of a term with their units, or why it has none."""
-    words = {"bound_rel": "{:.2%}", "bound_px": "{:.3f} px", "bound_deg": "{:.2f} degrees"}
-    known = [words[name].format(term[name]) for name in BOUNDS if term[name] is not None]
-    return ", ".join(known) or f"none: {term['no_bound']}"
 
 
 def summed(left: dict[str, Any]) -> str:
