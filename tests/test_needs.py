@@ -86,6 +86,9 @@ def test_seconds_come_from_the_trade_where_the_entry_names_the_knob(tmp_path):
     assert needs.bought_by_knobs(build) == {"render.denoise": 3.0}
     entry = {"term": "denoiser", "modelled": False, "because": "knob render.denoise; 48 samples", "could_cost": ""}
     assert needs.told(entry, needs.bought_by_knobs(build))["saved_s"] == 3.0
+    unmeasured = needs.told(entry | {"because": "knob render.depth"}, {})
+    assert unmeasured["saved_s"] is None
+    assert unmeasured["saved_by"] == "insitu trade --knobs render.depth measures it"
 
 
 def test_sums_are_over_what_is_known():
