@@ -7,11 +7,11 @@ from command import DESK, command
 from pipeline.conventions import direction_from_latlong
 from pipeline.image.truth import Truth
 from pipeline.light import near_field
-from pipeline.run import settings
+from pipeline.run import settings, substitution
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build
 from pipeline.run.substitution import true_environment, waterfall
-from pipeline.types import Raster
+from pipeline.types import Camera, Raster, View
 from stages.knobs import KNOBS
 from stages.order import graph
 
@@ -23,6 +23,11 @@ def built(out) -> Build:
 def test_unknown_names_are_refused(desk_build):
     with pytest.raises(ManifestError, match="lens"):
         waterfall(built(desk_build), ["lens"], str)
+
+
+def test_unknown_terms_are_refused(desk_build):
+    with pytest.raises(ManifestError, match="--without: is colour; expected names of alignment"):
+        waterfall(built(desk_build), [], str, ["colour"])
 
 
 def test_environment_is_turned_and_scaled():
@@ -53,6 +58,52 @@ def test_true_light_is_brought_to_where_the_map_that_it_replaces_holds():
     row, column = np.unravel_index(found.argmax(), found.shape)
     x, _, z = direction_from_latlong(np.array((column + 0.5) / 64), np.array((row + 0.5) / 32))
     assert np.degrees(np.arctan2(-z, x)) == pytest.approx(np.degrees(np.arctan(0.5)), abs=6)
+
+
+def near_values(light, valid):
+    """Values and truth of a room with objects at x = -0.5 and 0.5 m, seen from above by a lens of 10 px per metre."""
+    plate = np.ones((12, 24, 3))
+    used = Raster(Raster.split(light), "acescg", near_field.places(valid, np.array([0, 0.1, 2.0])))
+    down = np.array([[1, 0, 0, 0], [0, 0, -1, 1], [0, 1, 0, 0], [0, 0, 0, 1]], float)
+    camera = Camera(width=24, height=12, fx=10, fy=10, cx=12, cy=6)
+    values = {
+        "photographs": {"plate": Raster(Raster.split(plate), "acescg")}, "environment": used, "camera": camera,
+        "views": {"plate": View(world_from_camera=down, covariance=np.eye(6), route="given", rms_px=0, points=0)},
+        "wishes": {"object": [{"position_m": [x, 0.0]} for x in (-0.5, 0.5)]}, "facts": {},
+        "layers": Raster({"with.R": plate[..., 0]}, "acescg"),
+    }  # fmt: skip
+    elsewhere = [(np.array([x, 0.1, 0.0]), np.full(light.shape, 2.0 + x)) for x in (0.0, -0.5, 0.5)]
+    return values, Truth(plate, plate, {}, environment=light, elsewhere=elsewhere)
+
+
+def test_true_light_of_the_place_itself_is_taken_where_the_truth_tells_it():
+    light = np.ones((8, 16, 3))
+    values, truth = near_values(light, np.array([0.0, 0.11, 0.0]))
+    np.testing.assert_allclose(true_environment(values, truth)["R"], 2.0)
+    values, truth = near_values(light, np.array([0.2, 0.1, 0.0]))  # no place that it tells
+    np.testing.assert_allclose(true_environment(values, truth)["R"], 1.0)
+
+
+def test_layers_under_the_light_of_every_place_are_interpolated(monkeypatch):
+    """Each object's pixels have its own light, those halfway the mean; where any light changes, all are influenced."""
+    values, truth = near_values(np.ones((8, 16, 3)), np.array([0.0, 0.1, 0.0]))
+
+    def recompute(build, values, truth, names, given, last):
+        assert (names, last) == (["albedo"], "render")
+        level = float(given["environment"]["R"].mean())
+        influence = np.zeros((12, 24), np.float32)
+        influence[:, int(level * 4)] = 1
+        return {"layers": Raster({"with.R": np.full((12, 24), level), "influence": influence}, "acescg")}
+
+    monkeypatch.setattr(substitution, "recompute", recompute)
+    found = substitution.true_places(values, truth, None, ["probe", "albedo", "places"])
+    assert found["with.R"][6, 6] == pytest.approx(1.5, abs=0.02)  # feet at pixels (7, 6) and (17, 6): 1 : 75
+    assert found["with.R"][6, 17] == pytest.approx(2.5, abs=0.02)
+    np.testing.assert_allclose(found["with.R"][:, 11:13].mean(), 2.0, atol=1e-6)
+    assert sorted(np.flatnonzero(found["influence"].any(0))) == [6, 10]
+    assert found["influence"].max() == 1
+    with pytest.raises(ManifestError, match="does not tell the light at every object"):
+        substitution.true_places(values, Truth(truth.plate, truth.plate, {}), None, ["places"])
 
 
 @pytest.mark.slow

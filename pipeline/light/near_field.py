@@ -198,7 +198,7 @@ def assess(
             f"near field: the light at the objects differs by {error:.1%} from that at the probe, on every side of it"
         )
         return Assessment(None, numbers, [warning], _reason(False, because, cost, error))
-    cost += f"; {left:.2%} is left between the objects, the error of the room's measures, and what hangs before its walls"
+    cost += f"; {left:.2%} is left between the objects, with the error of the room and what hangs before its walls"
     return Assessment(target, numbers, [], _reason(True, because, cost, error))
 
 
