@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measures import cpu_seconds
-from benchmarks.scenes import Item, Scene, Shape
-from pipeline.camera.lens import ray_grid
+from benchmarks.scenes import Item, Scene, Shape, ray_grid
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.image.display import display_exposure
 from pipeline.light.environment import irradiance

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.scenes import Shape, ball, box, column, floor, looking, pinhole
-from pipeline.camera.lens import project, ray_grid
+from benchmarks.scenes import Shape, ball, box, column, floor, looking, pinhole, ray_grid
+from pipeline.camera.lens import project
 from pipeline.conventions import (
     direction_from_latlong,
     invert_rigid,

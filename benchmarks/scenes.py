@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.camera.lens import rays_through
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light.environment import irradiance
 from pipeline.types import Camera, Plane
@@ -140,6 +141,13 @@ def looking(eye: tuple[float, float, float], target: tuple[float, float, float])
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     pose[:3, 3] = eye
     return pose
+
+
+def ray_grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """`rays_through` every pixel centre: (H, W, 2) and (H, W, 2, 2)."""
+    y, x = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
+    xn, dxn = rays_through(camera, np.stack([x.ravel(), y.ravel()], -1))
+    return xn.reshape(*x.shape, 2), dxn.reshape(*x.shape, 2, 2)
 
 
 def pinhole(width: int, height: int, fov_deg: float = 50.0) -> Camera:

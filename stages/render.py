@@ -33,6 +33,7 @@ from pipeline.transport.near_one import near_one
 from pipeline.transport.passes import Halves, Interrupted
 from pipeline.transport.pilot import Effort
 from pipeline.transport.placing import clearances, feet, off_plane, place_objects
+from pipeline.transport.reflectance import reflected_radiance
 from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
 from pipeline.transport.trace import LensRays, Rays
@@ -288,7 +289,7 @@ def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
 def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
     """What was sampled, how noisy it is before denoising, and how well the closed form agrees with LS_noobj."""
     samples = halves.both
-    model = samples.albedo * canvas.light_traced / np.pi
+    model = reflected_radiance(samples.albedo, canvas.light_traced)
     bare = (samples.ground > 0.999) & (model > 0).all(1)
     covered = (samples.alpha > 0.99) & (samples.obj > 0).any(1)
     pixels = canvas.shape[0] * canvas.shape[1]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.image import dng
-from pipeline.image.raw import read_metadata, read_mosaic, read_rows, read_sensor
+from pipeline.image.raw import read_metadata, read_mosaic, read_sensor
 from pipeline.run.errors import CaptureError
 from tests import dng_writer as writer
 from tests.dng_writer import BYTE, DOUBLE, LONG, SHORT, SRATIONAL, UNDEFINED, write_dng
@@ -65,7 +65,6 @@ def test_every_coding_gives_back_what_was_written(tmp_path, coding, channels):
     found = read_mosaic(path, frame)
     assert found.dtype == np.uint16
     np.testing.assert_array_equal(found, samples)
-    np.testing.assert_array_equal(read_rows(path, frame, 11, 42), samples[11:42])
 
 
 @pytest.mark.parametrize("coding", ["plain", "plain_tiles", "14_bits", "lossless_jpeg", "lossless_jpeg_tiles"])
@@ -165,7 +164,6 @@ def test_interleaved_rows_and_columns_of_jpeg_xl(tmp_path):
     )  # fmt: skip
     frame = read_metadata(path)
     np.testing.assert_array_equal(read_mosaic(path, frame), samples)
-    np.testing.assert_array_equal(read_rows(path, frame, 13, 29), samples[13:29])
     assert frame.marks == []
 
 

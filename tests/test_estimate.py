@@ -12,7 +12,7 @@ from test_caustics import MIRROR_BSDF, film, placed
 from test_paths import lamp_of
 from test_transport import GREY, SIZE, all_rays, ground, looking_down, sky, sphere
 
-from pipeline.camera.lens import ray_grid
+from benchmarks.scenes import ray_grid
 from pipeline.light.environment import irradiance
 from pipeline.transport import passes
 from pipeline.transport.canvas import TRUSTED, Canvas, pictures

@@ -36,6 +36,12 @@ def eight_bit(picture: np.ndarray) -> np.ndarray:
     return (picture * 255 + 0.5).astype(np.uint8)
 
 
+def marker_corners_px(picture: np.ndarray, name: str, marker_id: int) -> tuple[np.ndarray, int]:
+    """Rough corners (K, 4, 2) of every marker with this id, and how many markers are seen."""
+    ids, quads = opencv_bridge.markers_px(picture, name)
+    return quads[ids == marker_id], len(ids)
+
+
 def board_errors(
     camera: Camera, tilt: float, noise: float = 0.0, tones: str = "gamma", blur: float = 0.0
 ) -> np.ndarray:
@@ -69,7 +75,7 @@ def test_marker_corners_are_unbiased_and_do_not_shrink(camera: Camera, tilt: flo
     pose = looking_at(np.zeros(3), tilt, 20 + tilt, 0.5, tilt / 3)
     picture = photograph(marker_print(MARKER), camera, pose, 5)
     picture = gaussian_filter(picture, blur) if blur else picture
-    quads, count = opencv_bridge.marker_corners_px(eight_bit(tone(picture)), MARKER["dictionary"], MARKER["id"])
+    quads, count = marker_corners_px(eight_bit(tone(picture)), MARKER["dictionary"], MARKER["id"])
     assert count == 1
     px = fit_marker(picture, quads[0], camera, BLACK)
     truth = project(camera, camera_points(pose, marker_points(MARKER["side_m"]))[0])
@@ -122,7 +128,7 @@ def test_april_tags_are_read_and_unbiased(family: str) -> None:
     tag = {"dictionary": family, "id": 3, "side_m": 0.1}
     assert np.abs(biases(tag, 60, 35, (0.8,))).max() < UNBIASED_PX
     _, picture, truth = close_up(tag, 60, 35, 1)
-    quads, count = opencv_bridge.marker_corners_px(eight_bit(tone(picture)), family, 3)
+    quads, count = marker_corners_px(eight_bit(tone(picture)), family, 3)
     assert (count, len(quads)) == (1, 1)
     assert np.abs(quads[0] - truth).max() < 1.5  # the same corner is the first
 
@@ -173,7 +179,7 @@ def test_april_tags_own_pixels_are_ours(name: str, agree: int) -> None:
             continue
     assert sum(distance < 0.1 for distance in off) >= agree
     assert np.abs(np.median(np.concatenate(ours), 0)).max() < 0.2
-    assert len(opencv_bridge.marker_corners_px(picture, family, 0)[0]) >= agree
+    assert len(marker_corners_px(picture, family, 0)[0]) >= agree
 
 
 def test_markers_of_real_photographs_are_found() -> None:

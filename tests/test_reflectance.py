@@ -55,7 +55,7 @@ def texel_positions(size: int) -> np.ndarray:
 def test_equations_6_to_8():
     light = np.array([2.0, 3, 4])
     rho = np.array([0.1, 0.2, 0.05])
-    l_r1, l_r2 = reflected_radiance(rho, light), reflected_radiance(np.ones(3), light)
+    l_r1, l_r2 = (reflected_radiance(np.pi * one, light) for one in (rho, np.ones(3)))
     np.testing.assert_allclose(updated_brdf(l_r1, l_r2), rho)
     assert np.isnan(updated_brdf(np.ones(3), np.zeros(3))).all()
 

@@ -8,7 +8,8 @@ import numpy as np
 from test_composite_render import inputs, wish
 from test_transport import GREY, camera, ground, looking_down, sky, sphere
 
-from pipeline.camera.lens import project, ray_grid
+from benchmarks.scenes import ray_grid
+from pipeline.camera.lens import project
 from pipeline.conventions import HALF_PIXEL, invert_rigid, transform_points
 from pipeline.light.environment import irradiance
 from pipeline.run import progress

@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.camera.rigid import nearest_rotation
-from pipeline.camera.stated import FLIP, chan_matrix, chan_numbers, read_pose, rigid
+from pipeline.camera.stated import FLIP, chan_matrix, read_pose, rigid
 from pipeline.run.camera_facts import PoseFacts
 from pipeline.run.errors import ManifestError
 from stages import ingest
@@ -32,6 +32,21 @@ def test_a_level_camera_looks_where_conventions_say() -> None:
     np.testing.assert_allclose(level[:3, 1], [0, -1, 0])
     turned = chan_matrix(np.zeros(3), np.array([0, 90.0, 0]), "zxy")
     np.testing.assert_allclose(turned[:3, 2], [-1, 0, 0], atol=1e-15)
+
+
+def chan_numbers(world_from_camera: np.ndarray, order: str = "zxy") -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) m and rotations (3,) deg about x, y, z of a pose, for a .chan line."""
+    R = (world_from_camera @ FLIP)[:3, :3]
+    first, second, third = ("xyz".index(axis) for axis in order)
+    sign = 1.0 if (second - first) % 3 == 1 else -1.0  # Tait-Bryan: R = R_third R_second R_first
+    angle = np.zeros(3)
+    angle[second] = -sign * np.arcsin(np.clip(R[third, first], -1, 1))
+    if abs(R[third, first]) < 1 - 1e-12:
+        angle[first] = sign * np.arctan2(R[third, second], R[third, third])
+        angle[third] = sign * np.arctan2(R[second, first], R[first, first])
+    else:  # first and third turn about the same axis: only their sum is known
+        angle[first] = -sign * np.arctan2(R[second, third], R[second, second])
+    return world_from_camera[:3, 3].copy(), np.degrees(angle)
 
 
 def test_the_named_axis_is_applied_first() -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from agreement import assert_same_mean
 
-from pipeline.camera.lens import project, ray_grid
+from benchmarks.scenes import ray_grid
+from pipeline.camera.lens import project
 from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_directions, transform_points
 from pipeline.light.environment import irradiance
 from pipeline.transport.difference import difference_block

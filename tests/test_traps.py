@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.camera.lens import project, ray_grid
+from benchmarks.scenes import ray_grid
+from pipeline.camera.lens import project
 from pipeline.camera.rigid import rotation_exp, umeyama
 from pipeline.conventions import latlong_directions, latlong_from_direction
 from pipeline.image.raw import read_metadata, read_mosaic

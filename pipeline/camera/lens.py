@@ -91,10 +91,3 @@ def rays_through(camera: Camera, px: np.ndarray) -> tuple[np.ndarray, np.ndarray
         dxn[some, 0, 0], dxn[some, 1, 1] = d / determinant / camera.fx, a / determinant / camera.fy
         dxn[some, 0, 1], dxn[some, 1, 0] = -b / determinant / camera.fy, -b / determinant / camera.fx
     return xn, dxn
-
-
-def ray_grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """`rays_through` every pixel centre: (H, W, 2) and (H, W, 2, 2)."""
-    y, x = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
-    xn, dxn = rays_through(camera, np.stack([x.ravel(), y.ravel()], -1))
-    return xn.reshape(*x.shape, 2), dxn.reshape(*x.shape, 2, 2)

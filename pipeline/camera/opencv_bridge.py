@@ -162,14 +162,8 @@ def refined_corners(
     return np.where((moved <= windows)[:, None], px, rough_px)
 
 
-def marker_corners_px(picture: np.ndarray, name: str, marker_id: int) -> tuple[np.ndarray, int]:
-    """Rough corners (K, 4, 2) of every marker with this id (x right, y down the print: clockwise), and all seen."""
-    ids, quads = markers_px(picture, name)
-    return quads[ids == marker_id], len(ids)
-
-
 def markers_px(picture: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Ids (K,) and rough corners (K, 4, 2) of every marker of a dictionary."""
+    """Ids (K,) and rough corners (K, 4, 2), clockwise from x right and y down the print, of a dictionary's markers."""
     import cv2
 
     small, step = shrunk(picture)

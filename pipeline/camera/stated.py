@@ -78,21 +78,6 @@ def chan_matrix(position_m: np.ndarray, degrees: np.ndarray, order: str) -> np.n
     return pose @ FLIP
 
 
-def chan_numbers(world_from_camera: np.ndarray, order: str = "zxy") -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) m and rotations (3,) deg about x, y, z of a pose, for a .chan line."""
-    R = (world_from_camera @ FLIP)[:3, :3]
-    first, second, third = ("xyz".index(axis) for axis in order)
-    sign = 1.0 if (second - first) % 3 == 1 else -1.0  # Tait-Bryan: R = R_third R_second R_first
-    angle = np.zeros(3)
-    angle[second] = -sign * np.arcsin(np.clip(R[third, first], -1, 1))
-    if abs(R[third, first]) < 1 - 1e-12:
-        angle[first] = sign * np.arctan2(R[third, second], R[third, third])
-        angle[third] = sign * np.arctan2(R[second, first], R[first, first])
-    else:  # first and third turn about the same axis: only their sum is known
-        angle[first] = -sign * np.arctan2(R[second, third], R[second, second])
-    return world_from_camera[:3, 3].copy(), np.degrees(angle)
-
-
 def usd_pose(path: Path, frame: float, unit_m: float | None, prim: str | None) -> np.ndarray:
     """``world_from_camera`` (4, 4) of a camera of a USD stage, its up axis and unit brought to conventions."""
     try:

@@ -162,38 +162,25 @@ def check_places(name: str, offsets: np.ndarray, counts: np.ndarray, tiff: Any, 
             furthest, what = stop, kind
 
 
-def read_samples(name: str, path: Path, layout: Layout, rows: tuple[int, int] | None = None) -> np.ndarray:
-    """Samples of the rows [start, stop) (default: all) as stored, (h, W) or (h, W, 3), uint16 or float32.
-
-    Only the pieces that hold those rows are read and decoded. Raises CaptureError for pieces that cannot be decoded.
-    """
-    start, stop = (0, layout.height) if rows is None or layout.interleave != (1, 1) else rows
-    shape = (stop - start, layout.width, layout.samples)
+def read_samples(name: str, path: Path, layout: Layout) -> np.ndarray:
+    """Samples as stored, (H, W) or (H, W, 3), uint16 or float32. Raises CaptureError for pieces that do not decode."""
+    shape = (layout.height, layout.width, layout.samples)
     picture = np.empty(shape, np.float32 if layout.floating else np.uint16)
-    wanted = [i for i in range(len(layout.offsets)) if _overlaps(layout.box(i), start, stop)]
 
     def place(index: int) -> None:
         top, left, height, width = layout.box(index)
         with path.open("rb") as stream:
             stream.seek(int(layout.offsets[index]))
             data = stream.read(int(layout.counts[index]))
-        piece = _decoded(name, data, layout, index)
-        first, last = max(start, top), min(stop, top + height)
-        picture[first - start : last - start, left : left + width] = piece[first - top : last - top, :width]
+        picture[top : top + height, left : left + width] = _decoded(name, data, layout, index)[:height, :width]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(place, wanted))
+        list(pool.map(place, range(len(layout.offsets))))
     picture = _deinterleaved(picture, layout.interleave)
-    if rows is not None and layout.interleave != (1, 1):
-        picture = picture[rows[0] : rows[1]]
     if layout.linearization is not None and not layout.floating:
         table = layout.linearization
         picture = table[np.minimum(picture, len(table) - 1)]
     return picture[..., 0] if layout.samples == 1 else picture
-
-
-def _overlaps(box: tuple[int, int, int, int], start: int, stop: int) -> bool:
-    return box[0] < stop and box[0] + box[2] > start
 
 
 def _deinterleaved(picture: np.ndarray, fields: tuple[int, int]) -> np.ndarray:

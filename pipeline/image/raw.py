@@ -212,17 +212,6 @@ def read_mosaic(path: Path, frame: Frame) -> np.ndarray:
     return read_sensor(path, frame).samples
 
 
-def read_rows(path: Path, frame: Frame, start: int, stop: int) -> np.ndarray:
-    """Rows [start, stop) of `read_mosaic`; of a DNG in strips or tiles only those that hold them are decoded."""
-    file = _dng_or_none(path, frame)
-    if file is None or file.kind == "xtrans" or dng.black_ripple(file.tags) is not None:
-        return read_mosaic(path, frame)[start:stop]
-    top, left, bottom, right = file.area
-    if (bottom - top, right - left) != (frame.height, frame.width):
-        raise _other_size(frame, (bottom - top, right - left))
-    return read_samples(frame.file, path, file.layout, (top + start, top + stop))[:, left:right]
-
-
 def _dng_or_none(path: Path, frame: Frame) -> _Dng | None:
     """The DNG's directory; None for other files. Raises CaptureError when it is gone or damaged."""
     if not path.is_file():

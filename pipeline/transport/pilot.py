@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.transport.caustics import Film, thrown
 from pipeline.transport.denoise import continued, denoise
 from pipeline.transport.difference import difference_block
+from pipeline.transport.reflectance import reflected_radiance
 from pipeline.transport.region import BLUR_NOISE, CELL, GLANCE, Limits, Region, cell_pixels, near_objects, worth_a_look
 from pipeline.transport.scene import Worlds
 from pipeline.transport.trace import LensRays, Rays, Samples, trace, unchanged_block
@@ -108,7 +109,7 @@ def looked(
     else:
         cell_light = received(worlds, seen, coarse, GLANCE_SAMPLES, effort, GLANCE * CELL)[square]
     near = near_objects(worlds, seen, GLANCE * CELL)[square]
-    wanted = worth_a_look(glance, glance.albedo * cell_light / np.pi, grid, limits, near)
+    wanted = worth_a_look(glance, reflected_radiance(glance.albedo, cell_light), grid, limits, near)
     some, samples = np.flatnonzero(wanted), glance
     if len(some):
         few = pilot_samples(effort) <= GLANCE_SAMPLES * STRATA**2  # one kernel does for glance, pilot and first pass
@@ -124,7 +125,7 @@ def looked(
         cell_light[inside.ravel()] = received(
             worlds, rays[index[inside.ravel()]], inside.shape, pilot_samples(effort), effort, CELL
         )
-    model = samples.albedo * cell_light / np.pi
+    model = reflected_radiance(samples.albedo, cell_light)
     return Pilot(worlds, samples, model, light_thrown, spread, ~wanted, grid, shape, index, limits.tolerance)
 
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 
-def reflected_radiance(rho_d: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Equation 6: radiance of a diffuse surface with BRDF value ``rho_d`` under an irradiance (both (..., 3))."""
-    return rho_d * irradiance
+def reflected_radiance(albedo: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Equation 6: radiance of a diffuse surface, rho_d = albedo / pi, under an irradiance (both (..., 3))."""
+    return np.asarray(albedo * irradiance / np.pi)
 
 
 def updated_brdf(l_r1: np.ndarray, l_r2: np.ndarray) -> np.ndarray:

@@ -240,7 +240,7 @@ def test_equations_6_to_8(rho, light, tint, saw):
     """One step is exact without inter-reflection, whatever the start."""
     brdf = rho * np.array([1.0, *(0.01 + 0.99 * np.array(tint))])
     e = 10.0**light * np.array([1.0, 0.3, 2.0])
-    found = updated_brdf(reflected_radiance(brdf, e), reflected_radiance(np.ones(3), e))
+    found = updated_brdf(*(reflected_radiance(np.pi * one, e) for one in (brdf, np.ones(3))))
     saw("formula.8", "exact", np.abs(found / brdf - 1).max())
 
 
