@@ -74,10 +74,15 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 	@$(INSITU) figures $(FIGURES) --picture docs/desk.jpg > docs/figures.md
 
 HARD := counter courtyard lacquer cellar corner
+TRUTHS_cellar := ,places
+OFF_cellar := --without alignment,exposures,near_field
+OFF_lacquer := --without gloss
+OFF_corner := --without bounces
 figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the other bundled captures (minutes)
 	@for c in $(HARD); do for q in preview draft; do \
-		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; \
-		$(INSITU) evaluate sample_captures/$$c --out build/figures/$${c}_draft --with-truth probe,pose,camera,albedo; done
+		$(INSITU) run sample_captures/$$c --quality $$q --out build/figures/$${c}_$$q; done; done
+	@$(foreach c,$(HARD),$(INSITU) evaluate sample_captures/$(c) --out build/figures/$(c)_draft \
+		--with-truth probe,pose,camera,albedo$(value TRUTHS_$(c)) $(value OFF_$(c)) &&) true
 	@$(INSITU) figures $(foreach c,$(HARD),$(foreach q,preview draft,build/figures/$(c)_$(q))) > docs/figures_hard.md
 
 extremes: $(READY)  ## run every case of tests/extremes/cases.toml, into docs/numerics.md, numerics.json and formulas.json

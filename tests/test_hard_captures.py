@@ -13,13 +13,12 @@ import pytest
 from command import SAMPLES
 
 from pipeline.image.truth import load_truth
-from pipeline.light import near_field
 from pipeline.probes.anchor import MOST_LEFT_PX
 from pipeline.run import artifacts as A
 from pipeline.run import formats, settings, substitution
 from pipeline.run.runner import Build
 from pipeline.transport import local_light
-from pipeline.types import Raster, Surface
+from pipeline.types import Raster
 from stages.knobs import KNOBS
 from stages.order import graph
 
@@ -37,13 +36,24 @@ def evidence_of(out: Path, stage: str, term: str) -> dict[str, Any]:
     return next(row for row in rows if row["term"] == term)
 
 
+def values_of(build: Build) -> dict[str, Any]:
+    return {one.name: build.value(one) for stage in build.graph.stages for one in stage.outputs.values()}
+
+
 def forced(out: Path, name: str, change: Any, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Metrics of a build with an artifact replaced by what ``change`` makes of all values; the rest computed again."""
     build = built(out)
-    values = {one.name: build.value(one) for stage in build.graph.stages for one in stage.outputs.values()}
+    values = values_of(build)
     monkeypatch.setitem(substitution.TRUTHS, "forced", (name, lambda values, truth: change(values)))
     truth = load_truth(Path(values["facts"]["truth_path"]))
     return substitution.recompute(build, values, truth, ["forced"])["metrics"]
+
+
+def forced_off(out: Path, term: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Metrics of a build, and with a term of the model off, as by ``insitu evaluate --without``."""
+    build = built(out)
+    values = values_of(build)
+    return values["metrics"], substitution.forced_off(build, values, term)["metrics"]
 
 
 # ---------------------------------------------------------------- courtyard: a sun clipped in every frame
@@ -139,63 +149,82 @@ def test_the_ball_on_lacquer_is_found_by_the_print_beside_it(lacquer_build):
 
 
 @pytest.mark.slow
-def test_without_gloss_the_lacquer_is_worse(lacquer_build, monkeypatch):
-    """Forced to a diffuse ground. Predicted: 32 % of the shadows' change, 8 % of the light on objects (medians).
+def test_without_gloss_the_lacquer_is_worse(lacquer_build):
+    """Forced to a diffuse ground. Predicted: 32 % of the shadows' change.
 
     Measured: error of the shadows' change 0.062 -> 0.241, on the objects 0.050 -> 0.083; they mirror the
     ground, of which the plate shows what it is.
     """
-    from stages import reflectance
-
-    matt = Surface(scores=[{"model": "diffuse", "because": "forced"}])
-    monkeypatch.setattr(reflectance, "climb", lambda *_: matt)
-    row = evidence_of(lacquer_build, "reflectance", "specular lobe of the ground")
-    predicted = row["bound_rel"]
-    before = json.loads((lacquer_build / "evaluate/metrics.json").read_text())
-    after = forced(lacquer_build, "plane", lambda values: values["plane"], monkeypatch)
+    predicted = evidence_of(lacquer_build, "reflectance", "specular lobe of the ground")["bound_rel"]
+    before, after = forced_off(lacquer_build, "gloss")
     assert predicted > 0.2
     assert after["shadow_change_err"] - before["shadow_change_err"] > predicted / 2
-    added = np.sqrt(after["object_rel_err"] ** 2 - before["object_rel_err"] ** 2)  # errors add as squares
-    assert row["object_rel"] / 2 < added < 2 * row["object_rel"]
+    assert after["object_rel_err"] > 1.3 * before["object_rel_err"]
 
 
-# ---------------------------------------------------------------- cellar: lamps nearby, a shaking hand, labels that lie
+# ---------------------------------------------------------------- cellar: near lamps, a knocked camera, lying labels
 
 
 @pytest.mark.slow
-def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_cost(cellar_build, monkeypatch):
-    """Forced off: the map as the ball saw it, 0.3 m away. Predicted: 17 % of the light on what objects show the camera,
-    27 % of that on the plane; 6 % is left on the worst of six sides.
+def test_light_of_the_cellar_is_brought_to_the_objects_because_of_what_it_would_cost(cellar_build):
+    """Forced off: the map as the ball saw it, 0.3 m away. Predicted: 18 % of the light on what objects show the camera,
+    28 % of that on the plane; 6 % is left on the worst of six sides.
 
-    Measured: error on the objects 0.046 -> 0.154, of the shadows' change 0.062 -> 0.310.
+    Measured: error on the objects 0.045 -> 0.145, of the shadows' change 0.060 -> 0.306.
     """
     found = numbers(cellar_build, "probe")
     assert found["near_irradiance_error"] > 5 * KNOBS["probe"]().near_budget
     assert found["near_irradiance_error_left"] < 0.75 * found["near_irradiance_error"]
-
-    def unmoved(values: dict[str, Any]) -> Raster:
-        light = values["environment"]
-        rgb = near_field.at_probe(light.rgb(), light.attributes, near_field.room_of(values["facts"]))
-        return Raster({**light.channels, **Raster.split(rgb.astype(np.float32))}, light.space, light.attributes)
-
-    before = json.loads((cellar_build / "evaluate/metrics.json").read_text())
-    after = forced(cellar_build, "environment", unmoved, monkeypatch)
+    before, after = forced_off(cellar_build, "near_field")
     assert after["object_rel_err"] - before["object_rel_err"] > found["near_object_error"] / 2
     assert after["shadow_change_err"] - before["shadow_change_err"] > found["near_plane_error"] / 2
 
 
 @pytest.mark.slow
-def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
-    """The shift is the stated turn's; every exposure is that of the shutter, not of the label, but for a common factor.
+def test_true_light_of_the_places_explains_most_of_the_cellar(cellar_build):
+    """The near light is what is hard here: no other truth takes more off the shadows, and places more than one map.
 
-    Measured: 3.25 px of 3.18, exposures within 0.6 % where labels are 40 and 20 % off.
+    Measured: shadows' change 0.060; 0.057 under the true light amid the objects, 0.046 under that of each one's place;
+    0.058 with the true pose.
+    """
+    found = substitution.waterfall(built(cellar_build), ["probe", "pose", "places"], lambda _: None)
+    errors = {label: found[label]["shadow_change_err"] for label in ("nothing", "probe", "pose", "places")}
+    assert errors["places"] < errors["probe"] < errors["nothing"]
+    assert errors["places"] < errors["pose"]
+    assert errors["places"] < 0.85 * errors["nothing"]  # measured 0.76
+
+
+@pytest.mark.slow
+def test_frames_of_the_cellar_left_where_they_lie_cost_what_was_predicted(cellar_build):
+    """Forced off: alignment. Predicted: 3.8 % of the ball view's light would lie elsewhere by more than the shift.
+
+    The knocked frame is the one that most of the light is read from; the lamps are in the others. Measured: error on
+    the objects 0.045 -> 0.086, of the shadows' change 0.060 -> 0.098, of the albedo 0.10 -> 0.25.
+    """
+    said = evidence_of(cellar_build, "merge", "alignment of frames")
+    assert said["modelled"]
+    assert said["predicted_rel"] > 0.02
+    before, after = forced_off(cellar_build, "alignment")
+    for figure in ("object_rel_err", "shadow_change_err", "albedo_rel_err"):
+        assert after[figure] - before[figure] > said["predicted_rel"] / 2, figure
+
+
+@pytest.mark.slow
+def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
+    """Shifts are the stated turns'; every exposure is that of the shutter, not of the label, but for a common factor.
+
+    Measured: 4.20 px of 4.03 on the axis (off it a turn moves more, by a tenth at the corners), 3.24 of 3.18; exposures
+    within 0.6 % where labels are 40 and 20 % off.
     """
     camera = formats.read(cellar_build / "calibrate", A.CAMERA)
     merged = json.loads((cellar_build / "merge/record.json").read_text())
     aligned = next(row for row in merged["evidence"] if row["term"] == "alignment of frames")
     assert aligned["modelled"]
-    turned = camera.fx * np.tan(np.radians(0.30))
-    assert merged["numbers"]["shift_px"] == pytest.approx(turned, abs=0.2)
+    for view, degrees in (("plate", 0.30), ("ball_a", 0.38)):
+        turned = camera.fx * np.tan(np.radians(degrees))
+        (told,) = [line for line in merged["warnings"] if line.startswith(f"{view}: frames lay")]
+        assert float(told.split("up to ")[1].split()[0]) == pytest.approx(turned, rel=0.06)
+    assert not [line for line in merged["warnings"] if "tone curve" in line or "NoiseProfile" in line]
     truth = json.loads((SAMPLES / "cellar/truth/truth.json").read_text())["exposures"]
     rows = [row for view in formats.read(cellar_build / "merge", A.EXPOSURES).values() for row in view]
     off = np.array([np.log(row["estimated_s"] / truth[row["file"]]["true_s"]) for row in rows])
@@ -205,21 +234,16 @@ def test_hand_and_labels_of_the_cellar_are_found_out(cellar_build):
 
 
 @pytest.mark.slow
-def test_labels_of_the_cellar_at_their_word_cost_what_was_predicted(cellar_build, monkeypatch):
+def test_labels_of_the_cellar_at_their_word_cost_what_was_predicted(cellar_build):
     """Forced: exposures by their labels. Predicted: 2.7 % of the ball view's light, 32 % of what its short frames hold.
 
-    Those are the lamps. Measured: error on the objects 0.046 -> 0.077, of the shadows' change 0.062 -> 0.111, of the
-    albedo 0.098 -> 0.203: more than the first figure, as the lamps give half of the light on little of the picture.
+    Those are the lamps. Measured: error on the objects 0.045 -> 0.080, of the shadows' change 0.060 -> 0.116, of the
+    albedo 0.099 -> 0.203: more than the first figure, as the lamps give half of the light on little of the picture.
     """
-    from pipeline.image import bracket_exposure
-
     said = evidence_of(cellar_build, "merge", "exposure errors")
     assert said["modelled"]
     assert said["bound_rel"] > 0.25
-    labels = bracket_exposure.by_labels
-    monkeypatch.setattr(bracket_exposure, "estimate", lambda _, samples, *rest: labels([one.frame for one in samples]))
-    before = json.loads((cellar_build / "evaluate/metrics.json").read_text())
-    after = forced(cellar_build, "brackets", lambda values: values["brackets"], monkeypatch)
+    before, after = forced_off(cellar_build, "exposures")
     for figure in ("object_rel_err", "shadow_change_err", "albedo_rel_err"):
         assert said["predicted_rel"] / 2 < after[figure] - before[figure] < said["bound_rel"], figure
 
