@@ -385,6 +385,14 @@ def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
     assert 0.001 < budget["regions"]["object"]["mean_rel"]["total"] < 0.02
 
 
+def test_intervals_of_pixels_take_the_share_of_a_tile_that_typical_pixels_have():
+    """The plate's noise is each pixel's own; of the render's, a tile's RMS is what few bad pixels make it."""
+    own = {"plate": np.full((2, 2, 3), 4.0), "render": np.full((2, 2, 3), 1.0)}
+    found = pixels.of_intervals(own)
+    assert (found["plate"] == own["plate"]).all()
+    assert found["render"] == pytest.approx(pixels.TYPICAL**2 * own["render"])
+
+
 def test_nothing_inserted_is_the_plate_and_its_sigma():
     random = np.random.default_rng(3)
     rgb = 1 + random.random((16, 24, 3)).astype(np.float32)
