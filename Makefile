@@ -76,6 +76,7 @@ figures: $(READY)  ## regenerate docs/figures.md and its picture (minutes)
 HARD := counter courtyard lacquer cellar corner
 TRUTHS_cellar := ,places
 OFF_cellar := --without alignment,exposures,near_field
+OFF_courtyard := --without sun
 OFF_lacquer := --without gloss
 OFF_corner := --without bounces
 figures-hard: $(READY)  ## regenerate docs/figures_hard.md, of the other bundled captures (minutes)

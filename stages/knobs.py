@@ -91,6 +91,9 @@ class Probe(Params):
     rim: float = Field(
         0.999, gt=0.5, lt=1, description="outermost radius that may be used, as a fraction of the ball's"
     )
+    recover: Literal["auto", "never"] = Field(
+        "auto", description="flux of lamps that clip in every frame: solved for where something answers to it, or left"
+    )
     near_budget: float = Field(
         0.02, ge=0, le=1, description="error of irradiance at the objects beyond which [room] moves the map to them"
     )

@@ -51,7 +51,9 @@ def compute(
     plate, eye = lookup_channels(photographs["plate"])[..., :7], views["plate"].world_from_camera
     below = combine.plate_below(plate, camera, eye, observed.centre_world, merged.seen.shape)
     over = clipped.clipped_share(merged.share, list(maps.values())) * (1 - below.share)
-    witness = witness_of(shots, observed) if over.any() else Witness()
+    witness = Witness(missing="knob probe.recover = never")
+    if params.recover == "auto":
+        witness = witness_of(shots, observed) if over.any() else Witness()
     whole = completed(merged, shared, below, over, witness)
     gloss = ground_gloss.assess(
         whole.lamps.rgb, merged.rgb, merged.seen, below, plate, camera, eye, observed.centre_world

@@ -132,6 +132,7 @@ TRUTHS: dict[str, tuple[str, Callable[..., Any]]] = {
 TERMS: dict[str, tuple[str, dict[str, Any]]] = {
     "alignment": ("merge", {"align": "never"}),
     "exposures": ("merge", {"estimate_exposures": False}),
+    "sun": ("probe", {"recover": "never"}),
     "near_field": ("probe", {"near_budget": 1.0}),
     "gloss": ("reflectance", {"gloss": "never"}),
     "texture": ("reflectance", {"model": "uniform"}),
