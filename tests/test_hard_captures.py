@@ -18,7 +18,6 @@ from pipeline.run import artifacts as A
 from pipeline.run import formats, settings, substitution
 from pipeline.run.runner import Build
 from pipeline.transport import local_light
-from pipeline.types import Raster
 from stages.knobs import KNOBS
 from stages.order import graph
 
