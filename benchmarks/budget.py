@@ -45,8 +45,8 @@ SETTINGS = ("render.samples=16", "render.depth=8")
 KINDS = {
     "desk": "indoors: a window and three lamps, 4 and 7 degrees wide; a ball of 43 px",
     "courtyard": "one hard sun, clipped in every frame of the ball, under a clear sky",
-    "corner": "two bright walls within a metre that light the table and each other, no [room] stated: what the near field "
-    "does to the objects' light no sigma covers, and `not_covered` bounds by 4 to 13 % of it",
+    "corner": "two bright walls close by that light the table and each other, no [room] stated: what the near field "
+    "does to the light on the objects no sigma covers; `not_covered` bounds it, by 4 to 13 %",
 }
 EXPECTED = {"50": (0.45, 0.55), "68": (0.62, 0.74), "95": (0.90, 0.98)}
 QUANTILES = {"50": 0.67449, "68": 1.0, "95": 1.95996}  # of |z|, normal
