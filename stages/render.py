@@ -99,8 +99,6 @@ def compute(
         params.strategy, params.samples, params.depth, params.denoise, params.seed, adaptive=not params.light_groups
     )
 
-    upward = irradiance(environment.rgb(), plane.normal[None])[0]
-
     def worlds_under(light: np.ndarray, lamps: list[Emitter], objects: dict[str, Any]) -> tuple[Worlds, np.ndarray]:
         worlds = build_worlds(plane, albedo.rgb(), light, objects, local_proxies, lamps, surface, occluders)
         return worlds, irradiance(light, plane.normal[None])[0]
@@ -316,6 +314,9 @@ def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
     return numbers
 
 
+UNTRACED = "at most: pixels not traced, each as dear as a traced one"  # on desk it is two thirds of that
+
+
 def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, Any]]:
     """What was modelled of the transport, and why. Savings suppose that every pixel costs what a traced one does."""
     region, traced = numbers["influenced_fraction"], numbers["traced_fraction"]
@@ -329,6 +330,7 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             f"{numbers['left_out_noise']:.2%}), {numbers['left_out_mean']:+.1e} of the frame's light",
             "bound_rel": numbers["left_out_max"],
             "saved_rel": 1 / region - 1,
+            "saved_by": UNTRACED,
         },
         {
             "term": "every pixel of the region",
@@ -337,6 +339,7 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "could_cost": f"{between:.2%} of the plate at most, and the pilot's noise",
             "bound_rel": between,
             "saved_rel": max(region / traced - 1, 0.0),
+            "saved_by": UNTRACED,
         },
         {
             "term": "light tracing",
