@@ -40,6 +40,71 @@ SCHLICK_MEAN = 1 / 21  # 2 integral of (1 - c)^5 c
 DIP_MEAN = 1 / 126 / DIP_AT_EDGE  # the same of c (1 - c)^6
 
 
+def _schlick(cosine: Any) -> Any:
+    import drjit as dr
+
+    return dr.power(1.0 - dr.clip(dr.abs(cosine), 0.0, 1.0), 5)
+
+
+def _glossy_share(kept: Kept | None, base: Any, metallic: Any, alpha: Any, f0: Any, cos_i: Any) -> Any:
+    """Share of the samples that the glossy lobe gets: what it is expected to return of all."""
+    import drjit as dr
+
+    fresnel = f0 + (1 - f0) * _schlick(cos_i)
+    mirror, least = 1.0, 0.1
+    if kept is not None:
+        mirror, fresnel = kept.at(cos_i, alpha)
+    diffuse = (1 - metallic) * (1 - fresnel) * dr.mean(base)
+    diffuse += metallic * dr.maximum(dr.mean(base), least) * (1 - mirror)
+    glossy = metallic * dr.maximum(dr.mean(base), least) * mirror + (1 - metallic) * fresnel
+    return dr.clip(glossy / (glossy + diffuse + 1e-8), 0.05, 1.0 - 0.05 * (1 - metallic))
+
+
+def _rest(kept: Kept, cos_i: Any, cos_o: Any, alpha: Any) -> tuple[Any, Any]:
+    """What the facets of a mirror and of the dielectric leave to the lobe of the rest, over pi and a cosine."""
+    import drjit as dr
+
+    left = (1 - kept.at(cos_i, alpha)) * (1 - kept.at(cos_o, alpha))
+    left /= dr.maximum(1 - kept.over_cosine(alpha), 1e-6)
+    return left[0], left[1]
+
+
+def _again(kept: Kept, base: Any, tint: Any, alpha: Any) -> Any:
+    """Colour of light that met several facets of a metal (Kulla and Conty 2017)."""
+    import drjit as dr
+
+    mean = base + (1 - base) * SCHLICK_MEAN - tint * (base + (1 - base) * SCHLICK_AT_EDGE) * DIP_MEAN
+    share = kept.over_cosine(alpha)[0]
+    return dr.square(mean) * share / (1 - mean * (1 - share))
+
+
+def _value_and_pdf(
+    mi: Any, kept: Kept | None, wi: Any, wo: Any, base: Any, metallic: Any, alpha: Any, f0: Any, tint: Any
+) -> tuple[Any, Any]:
+    """BSDF times the cosine of ``wo``, and the density of sampling it, both directions above the surface."""
+    import drjit as dr
+
+    half = dr.normalize(wi + wo)
+    lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
+    d = lobe.eval(half)
+    glossy = d * lobe.smith_g1(wi, half) * lobe.smith_g1(wo, half) / (4 * wi.z)  # times cos(wo)
+    cosine, under = dr.clip(dr.abs(dr.dot(wi, half)), 0.0, 1.0), dr.inv_pi * wo.z
+    edge = _schlick(cosine)
+    dip = cosine * dr.power(1.0 - cosine, 6) / DIP_AT_EDGE * tint
+    metal = glossy * (base + (1 - base) * edge - dip * (base + (1 - base) * SCHLICK_AT_EDGE))
+    if kept is None:
+        fresnel = f0 + (1 - f0) * edge
+        dielectric = base * under * (1 - fresnel) + glossy * fresnel
+    else:
+        mirror, through = _rest(kept, wi.z, wo.z, alpha)
+        dielectric = glossy * mi.fresnel(cosine, kept.eta)[0] + base * under * through
+        metal += under * mirror * _again(kept, base, tint, alpha)
+    value = dielectric * (1 - metallic) + metal * metallic
+    share = _glossy_share(kept, base, metallic, alpha, f0, wi.z)
+    pdf_glossy = lobe.pdf(wi, half) / (4 * dr.dot(wo, half))
+    return value, share * pdf_glossy + (1 - share) * under
+
+
 def register(mi: Any) -> None:
     """Register ``insitu_gltf`` for the current variant.
 
@@ -47,9 +112,6 @@ def register(mi: Any) -> None:
     f0 as one number, when it is made.
     """
     import drjit as dr
-
-    def schlick(cosine: Any) -> Any:
-        return dr.power(1.0 - dr.clip(dr.abs(cosine), 0.0, 1.0), 5)
 
     class GltfBsdf(mi.BSDF):
         """Reflection only; two lobes, diffuse and glossy, sampled by their expected share."""
@@ -75,65 +137,23 @@ def register(mi: Any) -> None:
             alpha = dr.maximum(dr.square(self.roughness.eval_1(si, active)), MIN_ALPHA)
             return self.base.eval(si, active), metallic, alpha, self.f0.eval_1(si, active)
 
-        def _glossy_share(self, base: Any, metallic: Any, alpha: Any, f0: Any, cos_i: Any) -> Any:
-            fresnel = f0 + (1 - f0) * schlick(cos_i)
-            mirror, least = 1.0, 0.1
-            if self.kept is not None:
-                mirror, fresnel = self.kept.at(cos_i, alpha)
-            diffuse = (1 - metallic) * (1 - fresnel) * dr.mean(base)
-            diffuse += metallic * dr.maximum(dr.mean(base), least) * (1 - mirror)
-            glossy = metallic * dr.maximum(dr.mean(base), least) * mirror + (1 - metallic) * fresnel
-            return dr.clip(glossy / (glossy + diffuse + 1e-8), 0.05, 1.0 - 0.05 * (1 - metallic))
-
         @staticmethod
         def _flip(wi: Any, wo: Any) -> tuple[Any, Any]:
             sign = dr.sign(wi.z)
             return mi.Vector3f(wi.x, wi.y, wi.z * sign), mi.Vector3f(wo.x, wo.y, wo.z * sign)
 
-        @staticmethod
-        def _rest(kept: Kept, cos_i: Any, cos_o: Any, alpha: Any) -> tuple[Any, Any]:
-            """What the facets of a mirror and of the dielectric leave to the lobe of the rest, over pi and a cosine."""
-            left = (1 - kept.at(cos_i, alpha)) * (1 - kept.at(cos_o, alpha))
-            left /= dr.maximum(1 - kept.over_cosine(alpha), 1e-6)
-            return left[0], left[1]
-
-        @staticmethod
-        def _again(kept: Kept, base: Any, tint: Any, alpha: Any) -> Any:
-            """Colour of light that met several facets of a metal (Kulla and Conty 2017)."""
-            mean = base + (1 - base) * SCHLICK_MEAN - tint * (base + (1 - base) * SCHLICK_AT_EDGE) * DIP_MEAN
-            share = kept.over_cosine(alpha)[0]
-            return dr.square(mean) * share / (1 - mean * (1 - share))
-
         def _value_and_pdf(self, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
             wi, wo = self._flip(si.wi, wo)
-            base, metallic, alpha, f0 = self._parameters(si, active)
+            parameters = self._parameters(si, active)
             active = active & (wi.z > 0) & (wo.z > 0)
-            half = dr.normalize(wi + wo)
-            lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
-            d = lobe.eval(half)
-            glossy = d * lobe.smith_g1(wi, half) * lobe.smith_g1(wo, half) / (4 * wi.z)  # times cos(wo)
-            cosine, under = dr.clip(dr.abs(dr.dot(wi, half)), 0.0, 1.0), dr.inv_pi * wo.z
-            edge, tint = schlick(cosine), 1 - self.edge_tint.eval(si, active)
-            dip = cosine * dr.power(1.0 - cosine, 6) / DIP_AT_EDGE * tint
-            metal = glossy * (base + (1 - base) * edge - dip * (base + (1 - base) * SCHLICK_AT_EDGE))
-            if self.kept is None:
-                fresnel = f0 + (1 - f0) * edge
-                dielectric = base * under * (1 - fresnel) + glossy * fresnel
-            else:
-                mirror, through = self._rest(self.kept, wi.z, wo.z, alpha)
-                dielectric = glossy * mi.fresnel(cosine, self.kept.eta)[0] + base * under * through
-                metal += under * mirror * self._again(self.kept, base, tint, alpha)
-            value = dielectric * (1 - metallic) + metal * metallic
-            share = self._glossy_share(base, metallic, alpha, f0, wi.z)
-            pdf_glossy = lobe.pdf(wi, half) / (4 * dr.dot(wo, half))
-            pdf = share * pdf_glossy + (1 - share) * under
+            value, pdf = _value_and_pdf(mi, self.kept, wi, wo, *parameters, 1 - self.edge_tint.eval(si, active))
             return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             base, metallic, alpha, f0 = self._parameters(si, active)
             sign = dr.sign(si.wi.z)
             wi = mi.Vector3f(si.wi.x, si.wi.y, si.wi.z * sign)
-            share = self._glossy_share(base, metallic, alpha, f0, wi.z)
+            share = _glossy_share(self.kept, base, metallic, alpha, f0, wi.z)
             take_glossy = sample1 < share
             lobe = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True)
             half, _ = lobe.sample(wi, sample2)
