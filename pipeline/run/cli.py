@@ -137,7 +137,7 @@ def _scoring(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--without",
         metavar="TERMS",
-        help="force off alignment,exposures,near_field,gloss,texture,bounces: what they save",
+        help="force off alignment,exposures,sun,near_field,proxies,gloss,texture,bounces: what they are worth",
     )
 
 

@@ -134,6 +134,7 @@ TERMS: dict[str, tuple[str, dict[str, Any]]] = {
     "exposures": ("merge", {"estimate_exposures": False}),
     "sun": ("probe", {"recover": "never"}),
     "near_field": ("probe", {"near_budget": 1.0}),
+    "proxies": ("plane", {"find_proxies": "never"}),
     "gloss": ("reflectance", {"gloss": "never"}),
     "texture": ("reflectance", {"model": "uniform"}),
     "bounces": ("render", {"depth": 2}),
