@@ -25,7 +25,7 @@ from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport.gradient import Fit, fit
 from pipeline.transport.patches import enlarged
-from pipeline.transport.plate_texture import continued, read_plate, shrunk, texture_size, window_points
+from pipeline.transport.plate_texture import Texture, continued, read_plate, shrunk, texture_size, window_points
 from pipeline.transport.radiosity import Estimate
 from pipeline.transport.reflectance import updated_brdf
 from pipeline.transport.scale import disagreement, unsure_share, warning
@@ -35,6 +35,10 @@ from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Resu
 from stages import knobs
 
 HIGHEST = 0.98  # albedo that the render is given at most: a brighter ground would gain light at every bounce
+
+UNASKED = Surface(
+    scores=[{"model": "diffuse", "because": "not asked for: the lobe of a scene with proxies is unknown"}]
+)
 
 
 def compute(
@@ -62,7 +66,8 @@ def compute(
             "plate: shows none of the modelled rectangle; check the board's pose and the object positions"
         )
     values, kept = shrunk(texture)
-    light, seen, warnings, local_proxies = np.broadcast_to(alone, values.shape), texture.seen, [], proxies
+    light, seen, local_proxies = np.broadcast_to(alone, values.shape), texture.seen, proxies
+    warnings: list[str] = []
     near = None
     if proxies or any(occluder.vertices_m is not None for occluder in occluders):
         from pipeline.transport.local_light import local_light
@@ -74,20 +79,13 @@ def compute(
     known = seen > 0.5
     if not known.any():
         raise NumericalError("plate: every texel of the modelled rectangle is hidden or unlit; check the proxies")
-    measured = np.pi * updated_brdf(values, light)
-    surface = Surface(
-        scores=[{"model": "diffuse", "because": "not asked for: the lobe of a scene with proxies is unknown"}]
-    )
+    matt = measured = np.pi * updated_brdf(values, light)
+    surface, fitted = UNASKED, None
     if near is None:
-        points = window_points(plane, texture.window, shape)
-        eye = view.world_from_camera[:3, 3]
-        cells = cells_of(values, texture.variance, known, points, eye)
-        surface = climb(cells, environment.rgb(), plane.normal, params.gloss)
-        if surface.model != "diffuse":
-            measured = base_of(surface, values, environment.rgb(), plane.normal, points, eye)
-            known &= np.isfinite(measured).all(-1)
-    fitted = None
-    if params.route == "gradient" and surface.model == "diffuse":
+        surface, measured = glossy(values, measured, known, texture, shape, environment, plane, view, params.gloss)
+    if surface.model != "diffuse":
+        known &= np.isfinite(measured).all(-1)
+    elif params.route == "gradient":
         fitted = fit(
             plane, continued(measured, known * seen, texture.window, shape), local_proxies, occluders,
             environment.rgb(), plate, camera, view,
@@ -105,10 +103,8 @@ def compute(
             "nothing modelled casts; the albedo there continues its surroundings. Describe what casts it as a [[proxy]]"
         )
     sigma = np.pi * updated_brdf(np.sqrt(kept * texture.variance), light)
-    variance = environment.rgb("variance") if "variance.R" in environment.channels else None
-    unsure = unsure_share(environment.rgb(), variance, plane.normal, alone)
-    matt = np.pi * updated_brdf(values, light)[known] if surface.model != "diffuse" else None
-    scale = disagreement(measured[known], sigma[known], unsure, matt)
+    unsure = unsure_light(environment, plane, alone)
+    scale = disagreement(measured[known], sigma[known], unsure, matt[known] if surface.model != "diffuse" else None)
     if said := warning(scale, np.quantile(measured[known], 0.01, axis=0)):
         warnings.append(said)
     if params.model == "uniform":
@@ -143,6 +139,25 @@ def compute(
     ]
     outputs = {"albedo": raster, "surface": surface, "local_proxies": local_proxies}
     return Result(outputs, numbers, warnings, terms)
+
+
+def glossy(
+    values: np.ndarray, matt: np.ndarray, known: np.ndarray, texture: Texture, shape: tuple[int, int],
+    environment: Raster, plane: Plane, view: View, gloss: str,
+) -> tuple[Surface, np.ndarray]:  # fmt: skip
+    """The rung of gloss that held-out cells ask for, and the albedo (h, w, 3) under it: ``matt`` where none."""
+    points, eye = window_points(plane, texture.window, shape), view.world_from_camera[:3, 3]
+    cells = cells_of(values, texture.variance, known, points, eye)
+    surface = climb(cells, environment.rgb(), plane.normal, gloss)
+    if surface.model == "diffuse":
+        return surface, matt
+    return surface, base_of(surface, values, environment.rgb(), plane.normal, points, eye)
+
+
+def unsure_light(environment: Raster, plane: Plane, alone: np.ndarray) -> float:
+    """Share of the plane's irradiance that is unsure, by the map's variance where it has one."""
+    variance = environment.rgb("variance") if "variance.R" in environment.channels else None
+    return unsure_share(environment.rgb(), variance, plane.normal, alone)
 
 
 def unhidden(plate: Raster, occluders: list[Occluder]) -> Raster:

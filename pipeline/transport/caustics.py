@@ -16,6 +16,7 @@ Arvo, *Backward ray tracing*, 1986; Veach, *Robust Monte Carlo methods for light
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -133,9 +134,33 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     import drjit as dr
 
     mi = worlds.mi
-    scene = worlds.with_objects
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed % 2**32, count)
+    state = (
+        *_emitted(worlds, lamp, count, sampler),
+        dr.full(mi.Float, float("inf"), count),
+        dr.full(mi.Int32, MIRRORS, count),
+        dr.full(mi.Bool, False, count),
+        dr.zeros(mi.SurfaceInteraction3f, count),
+        sampler,
+    )
+    body = functools.partial(_flown, worlds, mi.BSDFContext(mi.TransportMode.Importance))
+    _, _, flux, ratio, _, landed, found, _ = dr.while_loop(state, lambda *s: s[0], body, label="photons")
+    landed, value, per_area, ratio = _towards_camera(worlds, film, found, landed, flux, ratio)
+    keep = landed & dr.all(dr.isfinite(value))
+    on_object = dr.select(worlds.is_local(found), mi.Float(0.0), mi.Float(1.0))
+    numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio, on_object)]
+    dr.eval(keep, numbers)  # once, else every gather below would run the whole kernel again
+    index = mi.UInt32(dr.compress(keep))
+    rows = np.stack([np.asarray(dr.gather(mi.Float, number, index)) for number in numbers]).astype(float)
+    return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7], "on_object": rows[8]}
+
+
+def _emitted(worlds: Worlds, lamp: LightGroup, count: int, sampler: Any) -> tuple[Any, Any, Any]:
+    """Photons of a lamp across the objects' bounding spheres: which carry light, their rays, flux."""
+    import drjit as dr
+
+    mi = worlds.mi
     anywhere = dr.zeros(mi.SurfaceInteraction3f, count)
     light, weight = lamp.scene.sample_emitter_direction(anywhere, sampler.next_2d(), False)
     choice = dr.minimum(mi.UInt32(sampler.next_1d() * len(worlds.bounds)), len(worlds.bounds) - 1)
@@ -144,52 +169,54 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     centre = mi.Point3f(*columns[:3])
     start = centre + mi.Frame3f(light.d).to_world(mi.Vector3f(disc.x, disc.y, 0.0))
     far = kernel_input(mi, 4 * (np.abs(worlds.plane.corners_m).max() + np.abs(worlds.bounds).sum(1).max()))
-    eye = mi.Point3f(*[kernel_input(mi, v) for v in film.origin])
     flux = dr.select(light.pdf > 0, weight / disc_density(worlds, start, light.d), mi.Color3f(0.0))
-    context = mi.BSDFContext(mi.TransportMode.Importance)
+    return dr.any(flux != 0), mi.Ray3f(start + light.d * far, -light.d), flux
 
-    def body(*state: Any) -> tuple[Any, ...]:
-        active, ray, flux, ratio, left, landed, found, sampler = state
-        hit = scene.ray_intersect(ray, active=active)
-        local = worlds.is_local(hit)
-        rough = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Smooth)
-        arrives = active & hit.is_valid() & (left < MIRRORS) & (local | (rough & dr.isinf(ratio)))
-        # Half rough and half mirror: it ends there or goes on, by a coin.
-        either = arrives & ~local & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Delta)
-        arrives &= ~either | (sampler.next_1d(either) < 0.5)
-        flux = dr.select(either, 2 * flux, flux)
-        found = dr.select(arrives, hit, found)
-        landed |= arrives
-        # On an object: after a rough one the path ends at the next surface, whatever that is.
-        onward = active & hit.is_valid() & ~arrives & ~local & dr.isinf(ratio) & (left > 0)
-        drawn, weight = hit.bsdf().sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
-        outward = hit.to_world(drawn.wo)
-        # Shading normals make a BSDF asymmetric (Veach, section 5.3).
-        coming, going = dr.dot(hit.n, -ray.d), dr.dot(hit.n, outward)
-        cos_in, cos_out = mi.Frame3f.cos_theta(hit.wi), mi.Frame3f.cos_theta(drawn.wo)
-        onward &= (coming * cos_in > 0) & (going * cos_out > 0)
-        weight *= dr.abs(cos_in * going / (cos_out * coming))
-        flux = dr.select(onward, flux * weight, flux)
-        delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
-        scatters = onward & ~delta
-        onward &= dr.any(flux != 0) & (delta | (left == MIRRORS))  # rough only as the first and only one
-        off_one = against_camera(worlds, hit, outward, -ray.d)
-        ratio = dr.select(scatters, off_one, ratio)
-        return onward, dr.select(onward, hit.spawn_ray(outward), ray), flux, ratio, left - 1, landed, found, sampler
 
-    infinite = dr.full(mi.Float, float("inf"), count)
-    ray = mi.Ray3f(start + light.d * far, -light.d)
-    state = (
-        dr.any(flux != 0),
-        ray,
-        flux,
-        infinite,
-        dr.full(mi.Int32, MIRRORS, count),
-        dr.full(mi.Bool, False, count),
-        dr.zeros(mi.SurfaceInteraction3f, count),
-        sampler,
-    )
-    _, ray, flux, ratio, _, landed, found, _ = dr.while_loop(state, lambda *s: s[0], body, label="photons")
+def _flown(worlds: Worlds, context: Any, *state: Any) -> tuple[Any, ...]:
+    """One flight of the photons, to where they land or to the next surface."""
+    import drjit as dr
+
+    mi = worlds.mi
+    scene = worlds.with_objects
+    active, ray, flux, ratio, left, landed, found, sampler = state
+    hit = scene.ray_intersect(ray, active=active)
+    local = worlds.is_local(hit)
+    rough = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Smooth)
+    arrives = active & hit.is_valid() & (left < MIRRORS) & (local | (rough & dr.isinf(ratio)))
+    # Half rough and half mirror: it ends there or goes on, by a coin.
+    either = arrives & ~local & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Delta)
+    arrives &= ~either | (sampler.next_1d(either) < 0.5)
+    flux = dr.select(either, 2 * flux, flux)
+    found = dr.select(arrives, hit, found)
+    landed |= arrives
+    # On an object: after a rough one the path ends at the next surface, whatever that is.
+    onward = active & hit.is_valid() & ~arrives & ~local & dr.isinf(ratio) & (left > 0)
+    drawn, weight = hit.bsdf().sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
+    outward = hit.to_world(drawn.wo)
+    # Shading normals make a BSDF asymmetric (Veach, section 5.3).
+    coming, going = dr.dot(hit.n, -ray.d), dr.dot(hit.n, outward)
+    cos_in, cos_out = mi.Frame3f.cos_theta(hit.wi), mi.Frame3f.cos_theta(drawn.wo)
+    onward &= (coming * cos_in > 0) & (going * cos_out > 0)
+    weight *= dr.abs(cos_in * going / (cos_out * coming))
+    flux = dr.select(onward, flux * weight, flux)
+    delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
+    scatters = onward & ~delta
+    onward &= dr.any(flux != 0) & (delta | (left == MIRRORS))  # rough only as the first and only one
+    off_one = against_camera(worlds, hit, outward, -ray.d)
+    ratio = dr.select(scatters, off_one, ratio)
+    return onward, dr.select(onward, hit.spawn_ray(outward), ray), flux, ratio, left - 1, landed, found, sampler
+
+
+def _towards_camera(
+    worlds: Worlds, film: Film, found: Any, landed: Any, flux: Any, ratio: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Of the photons at ``found``: which the camera sees, and ``value``, ``per_area`` and ``ratio`` of `_landed`."""
+    import drjit as dr
+
+    mi = worlds.mi
+    scene = worlds.with_objects
+    eye = mi.Point3f(*[kernel_input(mi, v) for v in film.origin])
     back = found.to_world(found.wi)  # where the photon came from
     offset = eye - found.p
     distance = dr.norm(offset)
@@ -207,11 +234,4 @@ def _landed(worlds: Worlds, film: Film, lamp: LightGroup, count: int, seed: int)
     density = direction_density(worlds, found.p, normal, back, pdf)
     value *= flux / cosine
     ratio = dr.select(density > 0, ratio * cosine / density, float("inf"))
-    per_area = dr.abs(dr.dot(found.n, toward)) / dr.square(distance)
-    keep = landed & dr.all(dr.isfinite(value))
-    on_object = dr.select(worlds.is_local(found), mi.Float(0.0), mi.Float(1.0))
-    numbers = [mi.Float(number) for number in (*found.p, *value, per_area, ratio, on_object)]
-    dr.eval(keep, numbers)  # once, else every gather below would run the whole kernel again
-    index = mi.UInt32(dr.compress(keep))
-    rows = np.stack([np.asarray(dr.gather(mi.Float, number, index)) for number in numbers]).astype(float)
-    return {"point": rows[:3].T, "value": rows[3:6].T, "per_area": rows[6], "ratio": rows[7], "on_object": rows[8]}
+    return landed, value, dr.abs(dr.dot(found.n, toward)) / dr.square(distance), ratio

@@ -47,7 +47,6 @@ def trace_paths(
     import drjit as dr
 
     mi = worlds.mi
-    context = mi.BSDFContext()
     lamps = [emitter for emitter in scene.emitters() if not emitter.is_environment()]
     # Textured lights are not sampled, see `pipeline.transport.surfaces.area_emitter`.
     aimed = [lamp for lamp in lamps if mi.traverse(lamp)["sampling_weight"] > 0]
@@ -71,22 +70,10 @@ def trace_paths(
         bsdf = hit.bsdf()
         smooth = onward & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         for group in lights:
-            light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(smooth), False, smooth)
-            lit = smooth & (light.pdf > 0)
-            lit &= ~scene.ray_test(hit.spawn_ray(light.d), lit)
-            value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(light.d), lit)
-            weight = light.pdf / (light.pdf + pdf)
-            if caustic is not None and group.compact:
-                shared = lit & caustic.active
-                weight = dr.select(shared, 1 / (1 + caustic.against(hit, ray, light.d)), weight)
-            found += dr.select(lit, through * value * radiance * weight, 0.0)
+            found = _aimed_far(mi, scene, group, hit, ray, smooth, through, found, caustic, sampler)
         for lamp in aimed:
-            light, radiance = lamp.sample_direction(hit, sampler.next_2d(smooth), smooth)
-            lit = smooth & (light.pdf > 0)
-            lit &= ~scene.ray_test(hit.spawn_ray_to(light.p), lit)
-            value, pdf = bsdf.eval_pdf(context, hit, hit.to_local(light.d), lit)
-            found += dr.select(lit, through * value * radiance * (light.pdf / (light.pdf + pdf)), 0.0)
-        drawn, weight = bsdf.sample(context, hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
+            found = _aimed_near(mi, scene, lamp, hit, smooth, through, found, sampler)
+        drawn, weight = bsdf.sample(mi.BSDFContext(), hit, sampler.next_1d(onward), sampler.next_2d(onward), onward)
         through = dr.select(onward, through * weight, 0.0)
         delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
         kept = mirrors & delta
@@ -110,6 +97,35 @@ def trace_paths(
     )
     state = vertex(worlds.lights, *state)
     return dr.while_loop(state, lambda *s: s[0], functools.partial(vertex, (worlds.whole,)), label="path")[3]
+
+
+def _aimed_far(
+    mi: Any, scene: Any, group: LightGroup, hit: Any, ray: Any, active: Any, through: Any, found: Any,
+    caustic: Caustic | None, sampler: Any,
+) -> Any:  # fmt: skip
+    """``found`` and what a sample of a light group's directions adds at a vertex."""
+    import drjit as dr
+
+    light, radiance = group.scene.sample_emitter_direction(hit, sampler.next_2d(active), False, active)
+    lit = active & (light.pdf > 0)
+    lit &= ~scene.ray_test(hit.spawn_ray(light.d), lit)
+    value, pdf = hit.bsdf().eval_pdf(mi.BSDFContext(), hit, hit.to_local(light.d), lit)
+    weight = light.pdf / (light.pdf + pdf)
+    if caustic is not None and group.compact:
+        shared = lit & caustic.active
+        weight = dr.select(shared, 1 / (1 + caustic.against(hit, ray, light.d)), weight)
+    return found + dr.select(lit, through * value * radiance * weight, 0.0)
+
+
+def _aimed_near(mi: Any, scene: Any, lamp: Any, hit: Any, active: Any, through: Any, found: Any, sampler: Any) -> Any:
+    """``found`` and what a sample of an object that gives light adds at a vertex."""
+    import drjit as dr
+
+    light, radiance = lamp.sample_direction(hit, sampler.next_2d(active), active)
+    lit = active & (light.pdf > 0)
+    lit &= ~scene.ray_test(hit.spawn_ray_to(light.p), lit)
+    value, pdf = hit.bsdf().eval_pdf(mi.BSDFContext(), hit, hit.to_local(light.d), lit)
+    return found + dr.select(lit, through * value * radiance * (light.pdf / (light.pdf + pdf)), 0.0)
 
 
 def distant(
