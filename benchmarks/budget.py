@@ -1,6 +1,6 @@
 """Do the stated uncertainties hold? Places photographed and built again and again; errors over sigma, pooled.
 
-    .venv/bin/python -m benchmarks.budget [COUNT] [--kind desk courtyard corner] [--folder build/budget] [--judge]
+    .venv/bin/python -m benchmarks.budget [COUNT] [--kind desk courtyard corner] [--folder FOLDER] [--judge] [--keep]
 
 Every capture (`benchmarks.resimulate`: own noise, shutter errors, corners, lens and pose) is built to the stage
 ``uncertainty`` and compared with the truth, scaled by the one factor s = median(LS_b / P) of the capture, as `evaluate`
@@ -115,8 +115,8 @@ def measured(build: Path, truth_file: Path, shared_truth: Path) -> dict[str, Any
     return {"scale": scale, "pixels": single, "means": means, "budget": budget["regions"], "cpu_seconds": seconds}
 
 
-def build_one(scene: Any, pictures: Any, number: int, folder: Path, made_by: str) -> None:
-    """Photograph and build capture ``number``, keep its record, delete the rest."""
+def build_one(scene: Any, pictures: Any, number: int, folder: Path, made_by: str, keep: bool = False) -> None:
+    """Photograph and build capture ``number``, keep its record, delete the rest unless it is to be kept."""
     work = folder / f"work_{number:03d}"
     shutil.rmtree(work, ignore_errors=True)
     photograph(scene, pictures, number, folder / "radiance", work / "capture")
@@ -132,7 +132,8 @@ def build_one(scene: Any, pictures: Any, number: int, folder: Path, made_by: str
         part.rename(part.with_suffix(".json"))
     else:
         say(f"capture {number}: insitu ended with {code}")
-    shutil.rmtree(work)
+    if not keep:
+        shutil.rmtree(work)
 
 
 def stacked(records: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -286,7 +287,7 @@ def page(found: dict[str, Any], command: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def build_missing(kind: str, count: int, folder: Path) -> None:
+def build_missing(kind: str, count: int, folder: Path, keep: bool = False) -> None:
     """Captures of one kind that are not there, or that other code made."""
     made_by = code()
     scene, pictures = place_of(SAMPLES / "scenes" / f"{kind}.toml", SAMPLES / kind, folder / "radiance")
@@ -294,7 +295,7 @@ def build_missing(kind: str, count: int, folder: Path) -> None:
         path = folder / f"capture_{number:03d}.json"
         if not path.exists() or json.loads(path.read_text())["code"] != made_by:
             began = time.process_time()
-            build_one(scene, pictures, number, folder, made_by)
+            build_one(scene, pictures, number, folder, made_by, keep)
             say(f"{kind}, capture {number}: {time.process_time() - began:.0f} CPU s")
 
 
@@ -304,10 +305,11 @@ def main() -> None:
     parser.add_argument("count", type=int, nargs="?", default=100)
     parser.add_argument("--kind", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--folder", type=Path, default=Path("build/budget"))
+    parser.add_argument("--keep", action="store_true", help="keep builds too, for benchmarks.budget_sources")
     parser.add_argument("--judge", action="store_true", help="build nothing, judge what there is")
     asked = parser.parse_args()
     for kind in () if asked.judge else asked.kind:
-        build_missing(kind, asked.count, asked.folder / kind)
+        build_missing(kind, asked.count, asked.folder / kind, asked.keep)
     kept, kinds = {}, {}
     for kind in KINDS:
         made_by, records, left_out = records_of(asked.folder / kind)

@@ -393,6 +393,25 @@ def test_intervals_of_pixels_take_the_share_of_a_tile_that_typical_pixels_have()
     assert found["render"] == pytest.approx(pixels.TYPICAL**2 * own["render"])
 
 
+def test_likelihood_tells_which_source_is_overstated():
+    """A shared source at half of what it states, an own one at twice: 40 captures of 12 places.
+
+    The shared one is one number per capture: its factor is known to 1 / sqrt(80) = 11 %; the own one better than 3 %.
+    """
+    from benchmarks.budget_sources import OWN, Capture, fitted
+
+    random = np.random.default_rng(5)
+    captures = []
+    for _ in range(40):
+        mode, noise = random.normal(0, 0.05, (1, 12, 3)), np.full((12, 3), 0.01)
+        error = 0.5 * random.normal() * mode[0] + 2 * noise * random.normal(size=(12, 3))
+        own = {name: noise**2 if name == "plate" else 0 * noise for name in OWN}
+        captures.append(Capture(error, {"turn": mode}, own))
+    found = dict(zip(["turn", *OWN], fitted(["turn", *OWN], captures), strict=True))
+    assert found["turn"] == pytest.approx(0.5, rel=0.33)
+    assert found["plate"] == pytest.approx(2, rel=0.1)
+
+
 def test_nothing_inserted_is_the_plate_and_its_sigma():
     random = np.random.default_rng(3)
     rgb = 1 + random.random((16, 24, 3)).astype(np.float32)
