@@ -5,7 +5,7 @@
 
 Errors of the pixels and regions that `benchmarks.budget` compares, of all captures whose builds were kept, are taken as
 normal with the covariance that modes, plate and render state; every source gets one factor on its sigma (flux and sky
-modes one for green, one for red and blue, as their channels are independent), fitted on all captures and on either half.
+modes one for green, one for red and blue: their channels are independent), fitted on all captures and on either half.
 `scatter`: errors about their mean over the captures; `truth`: whole errors.
 """
 
