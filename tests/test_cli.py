@@ -17,7 +17,7 @@ import pytest
 from command import DESK, FOCAL, GIVEN, HEIGHT, POSE, ROOT, WIDTH, command, copied, desk_with, dng, refused, tiny
 
 from pipeline.run.board_facts import DICTIONARIES
-from pipeline.run.cli import main
+from pipeline.run.cli import main, share_cores
 from stages.order import NAMES
 
 QUICK_CPU_S = 0.3  # mission: --help, --version and refused manifests
@@ -456,3 +456,16 @@ def test_evaluate_takes_the_capture_either_way():
     refused = command("evaluate")
     assert refused.returncode == 2
     assert "--capture" in refused.stderr
+
+
+def test_a_command_gives_openblas_one_thread_unless_told_otherwise(monkeypatch) -> None:
+    """Before numpy is there to read it: parsing the command line imports none."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    share_cores()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    share_cores()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    words = "import sys; from pipeline.run import cli; cli.build_parser(); sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", words], check=False).returncode == 0
