@@ -169,7 +169,9 @@ def _measure_patch(first: Exposed, second: Exposed, box: tuple[slice, slice]) ->
     wide = ~binary_dilation(~clear, iterations=GUARD_CELLS)
     clear = wide if np.mean(wide) >= LEAST_SHARE else clear
     a, b = np.where(clear, a, np.nan), np.where(clear, b, np.nan)
-    if (gain := float(np.nansum(b, dtype=float) / max(np.nansum(a, dtype=float), 1e-300))) > 0:
+    sums = [float(np.nansum(part, dtype=float)) for part in (a, b)]
+    if min(sums) > 0:  # else both are dark, and noise has no ratio
+        gain = sums[1] / sums[0]
         a, first = np.float32(gain) * a, replace(first, exposure=first.exposure / gain)
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(flat[0], flat[1], window)
