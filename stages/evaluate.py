@@ -99,9 +99,7 @@ def compute(
             f"the composite holds {found['non_finite']} values that are not finite; they are scored as black"
         )
     if truth is not None and truth.objects is None:
-        warnings.append(
-            "truth.json: names no objects, so its picture is taken to show those of scene.toml; add them"
-        )
+        warnings.append("truth.json: names no objects, so its picture is taken to show those of scene.toml; add them")
     return Result({"metrics": found, "selfcheck": checks, "error_map": error_map}, numbers, warnings)
 
 

@@ -176,7 +176,8 @@ def unhidden(plate: Raster, occluders: list[Occluder]) -> Raster:
 
 def texture_evidence(model: str, kept: float, measured: np.ndarray) -> dict[str, Any]:
     """How the texture was made, and what one albedo for all of the known texels (N, 3) would get wrong."""
-    spread = float(np.linalg.norm(measured.std(0)) / np.linalg.norm(np.median(measured, 0)))
+    scatter, middle = (float(np.linalg.norm(of(measured, axis=0))) for of in (np.std, np.median))
+    spread = scatter / middle if middle > 0 else float(scatter > 0)  # a black plane has none, or is none but spots
     return {
         "term": "texture",
         "modelled": model == "textured",
