@@ -132,4 +132,17 @@ def test_alignment_can_be_forced_and_forbidden():
     assert shift == pytest.approx(4, abs=0.1)
     assert evidence["modelled"] is False
     assert "merge.align = never" in evidence["because"]
-    assert alignment.align(bracket([(0, 0), (0.3, 0), (0, 0)]), NAMES, "always")[2]["modelled"] is True
+    colour = [replace(one, mosaic=np.repeat(one.mosaic[:, :, None], 3, 2), black=np.full((1, 3), BLACK),
+                      limit=np.full((1, 3), 0.998)) for one in bracket([(0, 0), (0.3, 0), (0, 0)])]  # fmt: skip
+    assert alignment.align(colour, NAMES)[2]["modelled"] is False
+    assert alignment.align(colour, NAMES, "always")[2]["modelled"] is True  # by fractions: there is no mosaic
+
+
+@pytest.mark.parametrize(("when", "place"), [("auto", (0.85, 0.85)), ("always", (0.3, -0.2))])
+def test_what_whole_cells_cannot_mend_is_not_said_to_be_aligned(when, place):
+    """A shift of more than a pixel, but of less along either side: no frame is moved, and the blur is told."""
+    frames = bracket([(0, 0), place, (0, 0)])
+    same, shift, evidence = alignment.align(frames, NAMES, when)
+    assert all(one is other for one, other in zip(same, frames, strict=True))
+    assert evidence["modelled"] is False
+    assert evidence["bound_px"] == shift == pytest.approx(np.hypot(*place), abs=0.05)

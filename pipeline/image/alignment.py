@@ -80,6 +80,9 @@ def align(
         said += f"; knob merge.align = {when}" if largest >= needed else ""
         return list(frames), largest, {**_evidence(False, said, f"blur of {largest:.3f} px"), "bound_px": largest}
     moved = [_moved(frame, *place) for frame, place in zip(frames, places, strict=True)]
+    if all(one is frame for one, frame in zip(moved, frames, strict=True)):
+        said += "; less than half a CFA cell along either side, which whole cells do not mend"
+        return moved, largest, {**_evidence(False, said, f"blur of {largest:.3f} px"), "bound_px": largest}
     left = "up to a pixel and what turned" if frames[0].mosaic.ndim == 2 else "noise of moved frames is smoothed"
     return moved, largest, _evidence(True, said, left)
 
