@@ -30,6 +30,20 @@ def test_unknown_terms_are_refused(desk_build):
         waterfall(built(desk_build), [], str, ["colour"])
 
 
+def test_empty_terms_are_none(desk_build):
+    refused = command("evaluate", DESK, "--out", desk_build, "--without", "sun,,colour, ")
+    assert refused.returncode == 2
+    assert "--without: is colour; expected" in refused.stderr
+
+
+@pytest.mark.parametrize(("names", "terms", "said"), [(["probe"], [], "--with-truth"), ([], ["sun"], "--without")])
+def test_a_capture_without_truth_is_refused_by_the_option_that_asks_for_it(names, terms, said, desk_build, monkeypatch):
+    build = built(desk_build)
+    monkeypatch.setattr(build, "value", lambda artifact: {})
+    with pytest.raises(ManifestError, match=f"^{said}: this capture has no truth"):
+        waterfall(build, names, str, terms)
+
+
 def test_environment_is_turned_and_scaled():
     """A map whose centre looks along +X of the world, under a rotation; the plate's unit is twice the truth's."""
     light = np.zeros((8, 16, 3), np.float32)

@@ -416,7 +416,7 @@ def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
 
         say(f"{'truth in place of':<40}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
         given = (args.with_truth, args.without)
-        names, terms = ([name.strip() for name in (text or "").split(",") if name] for text in given)
+        names, terms = ([name.strip() for name in (text or "").split(",") if name.strip()] for text in given)
         found = waterfall(build, names, say, terms)
         build.keep_waterfall(found)
         build.run(build.graph["report"])  # it shows the waterfall

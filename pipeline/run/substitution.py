@@ -155,13 +155,12 @@ def waterfall(
         artifact.name: build.value(artifact) for stage in build.graph.stages for artifact in stage.outputs.values()
     }
     path = values["facts"].get("truth_path")
+    asked = " and ".join(option for option, given in (("--with-truth", names), ("--without", without)) if given)
     if not path:
-        raise ManifestError("--with-truth: this capture has no truth; name it in capture.toml")
+        raise ManifestError(f"{asked}: this capture has no truth to tell errors by; name it in capture.toml")
     truth = load_truth(Path(path))
     if other := other_scene(truth.objects, values["wishes"]["object"]):
-        raise ManifestError(
-            f"--with-truth: the truth shows another scene ({'; '.join(other)}); undo that in scene.toml"
-        )
+        raise ManifestError(f"{asked}: the truth shows another scene ({'; '.join(other)}); undo that in scene.toml")
     result = {}
 
     def found(label: str, metrics: dict[str, Any]) -> None:
