@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from printed_board import looking_at
 
+from pipeline.camera import lens_ladder
 from pipeline.camera.adjustment import Adjustment
 from pipeline.camera.distortion import model_of
 from pipeline.camera.lens_ladder import Climbed, Photos, best_lens, disagreement, undecided
@@ -118,3 +119,19 @@ def test_terms_are_forced_in_and_out() -> None:
     row = bare.evidence[0]
     assert row["bound_px"] == pytest.approx(disagreement(truth("k1"), bare.fit.camera), rel=0.2)
     assert row["because"] == "knob calibrate.distortion = never"
+
+
+def test_a_term_that_four_fifths_of_the_photographs_do_not_determine_is_not_forced_in(monkeypatch) -> None:
+    """All of them together may: its error on those held out is infinite, so nothing tells what it is worth."""
+    honest = lens_ladder.held_out
+
+    def held_out(start, poses, photos, terms):
+        return honest(start, poses, photos, terms) + (np.inf if "p1" in terms else 0)
+
+    monkeypatch.setattr(lens_ladder, "held_out", held_out)
+    full, _ = best_lens(shots("k1", 4, 8), SIZE, [], "always")
+    assert full.terms == ("k1", "k2", "fy", "k3")
+    assert np.isfinite(full.held).all()
+    (row,) = [row for row in full.evidence if row["term"] == "lens p1 p2"]
+    assert not row["modelled"]
+    assert "do not determine" in row["no_bound"]

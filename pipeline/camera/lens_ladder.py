@@ -355,17 +355,18 @@ def forced(start: Camera, poses: list[np.ndarray], photos: Photos, distortion: s
         if distortion == "never":
             row |= cost_of(step, (), chosen, start, poses, photos)
             continue
+        error = held_out(start, poses, photos, terms + step)
+        errors[" ".join(terms + step)] = float(np.sqrt(error.mean()))
         try:
-            chosen = fit_model(start, poses, photos, terms + step)
+            richer = fit_model(start, poses, photos, terms + step)
         except NumericalError:
+            richer = None
+        if richer is None or not np.isfinite(error).all():  # too rich for all of them, or for four fifths
             row |= {"could_cost": "unknown", "no_bound": "these photographs do not determine it", **TRIED}
             continue
-        terms += step
-        error = held_out(start, poses, photos, terms)
         said = f"{because}; held-out error {np.sqrt(best.mean()):.4f} -> {np.sqrt(error.mean()):.4f} px"
         row |= {"modelled": True, "because": said}
-        best = error
-        errors[" ".join(terms)] = float(np.sqrt(error.mean()))
+        chosen, best, terms = richer, error, terms + step
     return Climbed(chosen, photos, terms, best, errors, rows)
 
 
