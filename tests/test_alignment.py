@@ -116,6 +116,18 @@ def test_without_structure_nothing_is_said_to_be_known():
     assert "no structure" in evidence["because"]
 
 
+def test_a_frame_below_the_stated_black_shows_no_shift():
+    """As of a dark frame whose metadata state too high a black; in one quadrant the others still tell."""
+    frames = bracket([(0, 0), (3, 2), (0, 0)])[:2]
+    under = [replace(one, mosaic=np.full_like(one.mosaic, int(BLACK) - 9)) for one in frames]
+    assert alignment.measure(under[0], frames[1]) is None
+    assert alignment.measure(*under) is None
+    part = frames[0].mosaic.copy()
+    part[:150, :210] = int(BLACK) - 9
+    found = alignment.measure(replace(frames[0], mosaic=part), frames[1])
+    assert (found.dx, found.dy) == pytest.approx((3, 2), abs=0.1)
+
+
 def test_what_a_shift_would_cost_is_the_light_that_it_carries_away():
     """Of a lamp of 30 % of the light, moved to another square: 30 %. What stays within its square costs nothing."""
     aligned = np.full((48, 60), 0.7 / (48 * 60))

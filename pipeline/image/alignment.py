@@ -168,6 +168,8 @@ def _measure_patch(first: Exposed, second: Exposed, box: tuple[slice, slice]) ->
     if min(a.shape) < 16 or np.mean(clear) < LEAST_SHARE:
         return None
     cap = min(np.nanmax(a), np.nanmax(b))  # what clips in one frame looks alike in both
+    if not cap > 0:  # nothing is brighter than the stated black
+        return None
     flat = [np.sqrt(np.clip(np.nan_to_num(part, nan=cap), 0, cap)).astype(np.float32) for part in (a, b)]
     wide = ~binary_dilation(~clear, iterations=GUARD_CELLS)
     clear = wide if np.mean(wide) >= LEAST_SHARE else clear
