@@ -95,7 +95,7 @@ class Probe(Params):
         "auto", description="flux of lamps that clip in every frame: solved for where something answers to it, or left"
     )
     near_budget: float = Field(
-        0.02, ge=0, le=1, description="error of irradiance at the objects beyond which [room] moves the map to them"
+        0.02, ge=0, le=1e6, description="error of irradiance at the objects beyond which [room] moves the map to them"
     )
 
 

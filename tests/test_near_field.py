@@ -9,6 +9,8 @@ from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light import near_field
 from pipeline.light.environment import AXES, irradiance, resize_environment, total_energy
 from pipeline.light.near_field import Room
+from pipeline.run.substitution import TERMS
+from stages.knobs import KNOBS
 
 PROBE, OBJECT = np.array([0.0, 0.04, 0.0]), np.array([0.5, 0.15, -0.35])
 CENTRE, SIZE, YAW = np.array([0.2, 0.7, -0.1]), np.array([3.0, 2.8, 2.4]), np.radians(25)
@@ -143,6 +145,20 @@ def test_light_on_what_objects_show_is_that_of_a_ball_seen_from_the_camera(maps)
     a, b = irradiance(small, normals), irradiance(moved, normals)
     errors = np.linalg.norm(a - b, axis=1) / np.linalg.norm(b, axis=1)
     assert found == pytest.approx(errors @ seen / seen.sum(), rel=0.06)  # 600 random normals: 4 % by chance
+
+
+def test_forced_off_beside_a_lamp_it_is_off():
+    """The probe 0.5 m from a lamp on the wall, the object 1.3 m: light on it is off by more than all of it."""
+    light = np.full((32, 64, 3), 0.05)
+    light[14:18, 14:18] = 50.0  # about +X
+    room = Room(np.array([0, 1.2, 0]), np.array([2.0, 2.4, 3.0]))
+    probe, places, eye = np.array([0.5, 1.1, 0]), [np.array([-0.3, 1.1, 0])], np.array([0, 2.0, 1.4])
+    stage, forced = TERMS["near_field"]
+    budget = KNOBS[stage](**forced).near_budget
+    found = near_field.assess(light, probe, places, room, budget, eye)
+    assert found.target is None
+    assert found.numbers["near_irradiance_error"] > 1
+    assert near_field.assess(light, probe, places, room, KNOBS[stage]().near_budget, eye).target is not None
 
 
 def test_without_a_room_the_error_is_stated_for_three_distances(maps):

@@ -133,7 +133,7 @@ TERMS: dict[str, tuple[str, dict[str, Any]]] = {
     "alignment": ("merge", {"align": "never"}),
     "exposures": ("merge", {"estimate_exposures": False}),
     "sun": ("probe", {"recover": "never"}),
-    "near_field": ("probe", {"near_budget": 1.0}),
+    "near_field": ("probe", {"near_budget": 1e6}),  # beside a lamp, light is off by more than all of it
     "proxies": ("plane", {"find_proxies": "never"}),
     "gloss": ("reflectance", {"gloss": "never"}),
     "texture": ("reflectance", {"model": "uniform"}),
