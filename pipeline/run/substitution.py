@@ -31,9 +31,8 @@ from pipeline.run.runner import Build, settle
 from pipeline.transport.plate_texture import continued, read_plate, texture_size
 from pipeline.types import Camera, Raster, View
 
-SAME_PLACE_M = (
-    0.02  # where the map holds is known from the ball's measured height; a lamp a metre off turns by a degree
-)
+# Where the map holds is known from the ball's measured height; by so much a lamp a metre off turns by a degree.
+SAME_PLACE_M = 0.02
 FIGURES = ("object_rel_err", "shadow_change_err", "faint_change_err", "shadow_rel_err")
 Values = dict[str, Any]
 
