@@ -178,3 +178,19 @@ def test_sampling_counts_the_pixels_that_a_lamp_covers():
     both = map_of(rgb, 0.0, {alike.ALIKE: repr(alike.ALIKE_PX * pixel), alike.ALIKE_VIEWS: "2"})
     assert alike.sampling_sigma(both, weight * alone) == pytest.approx(alike.sampled(10.0) / np.sqrt(2), rel=1e-3)
     assert not alike.sampling_sigma(map_of(rgb, 0.0, {}), weight * alone).any()
+
+
+def test_a_lamp_without_green_covers_what_a_white_one_does():
+    """Noise in its empty channel covers next to nothing: by that a red lamp would be unsure by all of its light."""
+    rgb, texels = square_lamp()
+    alone = np.zeros(rgb.shape)
+    alone.reshape(-1, 3)[texels] = rgb.reshape(-1, 3)[texels]
+    light = latlong_solid_angles(*rgb.shape[:2])[..., None] * alone
+    told = map_of(rgb, 0.0, {alike.ALIKE: "2"})
+    white = alike.sampling_sigma(told, light)
+    assert 0 < white.max() < 0.5
+    red = light * [1.0, 0.0, 0.01]
+    assert alike.sampling_sigma(told, red) == pytest.approx(white)
+    red[..., 1] = 1e-3 * light[..., 0] * np.random.default_rng(0).normal(size=rgb.shape[:2])
+    assert alike.sampling_sigma(told, red) == pytest.approx(white)
+    assert alike.sampling_sigma(told, 0 * light).max() == 1  # nothing there

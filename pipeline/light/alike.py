@@ -26,6 +26,7 @@ RAISED = "raised"  # of a map: what texels' variances were multiplied by because
 # Relative error of a lamp's light by the n pixels that it covers: (POINT exp(-n / FADES) , SPREAD / n), squares added,
 # of red and blue, each a quarter of an RGGB mosaic; of green, half of it, a `GREEN` of that. See `sampled`.
 POINT, FADES, SPREAD, GREEN = 8.0, 3.4, 1.0, 0.4
+HARDLY = 0.1  # of the brightest channel: no lamp that glows has so little green in ACEScg, only red and blue diodes
 
 
 def alike_rows(environment: Raster) -> int:
@@ -83,15 +84,16 @@ def sampled(pixels: float) -> np.ndarray:
 def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     """Relative sigma (3,) of the sum of ``light`` (H, W, 3) by the pixels that it covers; zero where no map says so.
 
-    Covered is ``(sum L)^2 / sum L^2`` over solid angle, of green, whose own error moves it least. Views lie on their
-    mosaics independently.
+    Covered is ``(sum L)^2 / sum L^2`` over solid angle, of green, whose own error moves it least; of a lamp that has
+    hardly any, of its brightest channel, as noise covers no pixels. Views lie on their mosaics independently.
     """
     if ALIKE not in environment.attributes:
         return np.zeros(3)
     pixel = np.radians(float(environment.attributes[ALIKE]) / ALIKE_PX) ** 2
-    solid, green = latlong_solid_angles(*environment.shape), light[..., 1]
-    squares = float((np.square(green) / solid).sum())
-    covered = float(green.sum()) ** 2 / squares if squares > 0 else 0.0
+    solid, sums = latlong_solid_angles(*environment.shape), light.sum((0, 1))
+    shape = light[..., 1 if sums[1] > HARDLY * sums.max() else int(np.argmax(sums))]
+    squares = float((np.square(shape) / solid).sum())
+    covered = float(shape.sum()) ** 2 / squares if squares > 0 else 0.0
     views = float(environment.attributes.get(ALIKE_VIEWS, 1.0))
     return sampled(max(covered / pixel, 1.0)) / np.sqrt(views)
 
