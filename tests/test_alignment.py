@@ -128,6 +128,17 @@ def test_a_frame_below_the_stated_black_shows_no_shift():
     assert (found.dx, found.dy) == pytest.approx((3, 2), abs=0.1)
 
 
+def test_what_no_shift_was_measured_of_is_told():
+    """A dark frame of three lies where its neighbour does, as said; one frame alone has nothing to lie off."""
+    frames = bracket([(0, 0), (0, 0), (4, 0)])
+    frames[0] = replace(frames[0], mosaic=np.full_like(frames[0].mosaic, int(BLACK)))
+    moved, _, evidence = alignment.align(frames, NAMES)
+    assert "1 of 2 pairs of frames show too little" in evidence["because"]
+    assert moved[0] is frames[0]
+    _, shift, evidence = alignment.align(frames[2:], NAMES[2:])
+    assert (shift, evidence["because"], evidence["bound_rel"]) == (None, "one frame", 0.0)
+
+
 def test_what_a_shift_would_cost_is_the_light_that_it_carries_away():
     """Of a lamp of 30 % of the light, moved to another square: 30 %. What stays within its square costs nothing."""
     aligned = np.full((48, 60), 0.7 / (48 * 60))

@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.image.radiometry import Exposed
 from pipeline.run.errors import CaptureError
+from pipeline.run.evidence import ABSENT
 
 LEAST_PX = 1.0  # half a CFA cell: less cannot be mended by whole cells, and blurs less than the demosaic does
 LEAST_SIGMAS = 5.0  # a shift that is no more than its uncertainty is none
@@ -53,6 +54,8 @@ def align(
     ``when``: if the shift asks for it, or always, or never. What a moved frame does not show at its edges is NaN.
     Raises CaptureError when the motion is too large or no shift.
     """
+    if len(frames) < 2:
+        return list(frames), None, {**_evidence(False, "one frame", "nothing"), **ABSENT}
     order = np.argsort([frame.exposure for frame in frames], kind="stable")
     shifts = [measure(frames[i], frames[j]) for i, j in pairwise(order)]
     places = np.zeros((len(frames), 2))
@@ -64,17 +67,13 @@ def align(
             _refuse(shift, f"{names[before]}, {names[after]}", frames[after].mosaic.shape[1])
     known = [shift for shift in shifts if shift is not None]
     if not known:
-        return (
-            list(frames),
-            None,
-            {
-                **_evidence(False, "no structure to measure a shift by", "blur"),
-                "no_bound": "frames without structure show no shift; nor would its blur show",
-            },
-        )
+        why = "frames without structure show no shift; nor would its blur show"
+        return list(frames), None, {**_evidence(False, "no structure to measure a shift by", "blur"), "no_bound": why}
     sigma = max(shift.sigma for shift in known)
     largest = float(np.hypot(*places.T).max())
     said = f"largest shift {largest:.3f} +- {sigma:.3f} px, quadrants within {max(s.quadrants for s in known):.2f} px"
+    if blind := len(shifts) - len(known):
+        said += f"; {blind} of {len(shifts)} pairs of frames show too little to tell, and are taken to lie alike"
     needed = max(LEAST_PX, LEAST_SIGMAS * sigma)
     if when == "never" or (when == "auto" and largest < needed) or largest == 0:
         said += f"; knob merge.align = {when}" if largest >= needed else ""
