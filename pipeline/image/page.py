@@ -178,7 +178,7 @@ TEMPLATE = """<!doctype html>
 <div class="row"><span>{{ k }}</span><span>{{ v }}</span></div>{% endfor %}</div>
 {%- if s.numbers | length > 16 %}</details>{% endif %}{% endif %}
 {%- if s.evidence %}<h3>What was modelled, and why</h3><div class="scroll"><table><thead><tr><th>term</th>
-<th>modelled</th><th>because</th><th>could cost</th><th>at most</th></tr></thead><tbody>{% for e in s.evidence %}
+<th>modelled</th><th>because</th><th>could cost</th><th>bound</th></tr></thead><tbody>{% for e in s.evidence %}
 <tr><td>{{ e.term }}</td>
 <td>{% if e.modelled is sameas true %}<span class="yes">yes</span>{% elif e.modelled is sameas false %}
 <span class="no">no</span>{% else %}{{ e.modelled }}{% endif %}</td><td>{{ e.because }}</td><td>{{ e.could_cost }}</td>

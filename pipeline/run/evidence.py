@@ -4,8 +4,8 @@ A stage writes ``{"term", "modelled", "because", "could_cost"}``. ``modelled`` i
 not wholly modelled has its cost in numbers, too, or says why it has none:
 
 bound_rel  the most that it could cost, as a share of what ``could_cost`` names
-bound_px   how far it could move things in the plate
-bound_deg  how far it could turn light
+bound_px   how far it could move things in the plate; of a lens, rms over the frame, and more in its corners
+bound_deg  how far it could turn light; of a ball, rms over it, and more at its rim
 no_bound   in words, why no number can be stated
 
 Of what is known by a standard uncertainty, two of it are the bound. What leaving the term out saved, where the stage
