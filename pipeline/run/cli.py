@@ -411,12 +411,12 @@ def at_work(args: argparse.Namespace, build: Build, last: str) -> int:
     """Verbs that compute."""
     from pipeline.run.derive import print_summary, unfinished
 
-    if getattr(args, "with_truth", None) or getattr(args, "without", None):
+    given = (getattr(args, "with_truth", None), getattr(args, "without", None))
+    names, terms = ([name.strip() for name in (text or "").split(",") if name.strip()] for text in given)
+    if names or terms:
         from pipeline.run.substitution import FIGURES, waterfall
 
         say(f"{'truth in place of':<40}" + "".join(f"{key.removesuffix('_err')[:9]:>10}" for key in FIGURES))
-        given = (args.with_truth, args.without)
-        names, terms = ([name.strip() for name in (text or "").split(",") if name.strip()] for text in given)
         found = waterfall(build, names, say, terms)
         build.keep_waterfall(found)
         build.run(build.graph["report"])  # it shows the waterfall
