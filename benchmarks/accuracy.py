@@ -69,6 +69,16 @@ def extremes(records: Records) -> float:
     return sum(row["ok"] for row in rows) / len(rows)
 
 
+def intervals(kind: str) -> Value:
+    """How many of the twelve intervals (four kinds of places, three shares) hold the truth as often as they state."""
+
+    def read(records: Records) -> float:
+        places = records["budget"]["kinds"][kind]["coverage"].values()
+        return float(sum(holds for place in places for holds in place["truth"]["holds"].values()))
+
+    return read
+
+
 MERGE, PROBE, RENDER, POSE, FIGURES = (
     f"`make {target}`" for target in ("bench-merge", "bench-probe", "bench-render", "bench-pose", "figures")
 )
@@ -123,6 +133,11 @@ PROMISES = [
     Promise("whole", "draft of desk, wall", 15, cell("desk", "draft", "seconds"), FIGURES, unit="s"),
     Promise("whole", "--help, --version and refused manifests, wall", 0.3, None,
             "`test_cli::test_quick_answers_are_quick_and_leave_numpy_alone`", unit="s"),
+    *(
+        Promise("uncertainty", f"intervals of 12 that hold, 100 captures of {kind}", 12, intervals(kind),
+                "`make bench-budget`", least=True)
+        for kind in ("desk", "courtyard", "corner")
+    ),
     Promise("extremes", "cases seen as they were defined", 1.0, extremes, "`make extremes`", least=True),
 ]  # fmt: skip
 
