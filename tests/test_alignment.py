@@ -146,6 +146,9 @@ def test_what_a_shift_would_cost_is_the_light_that_it_carries_away():
     far, near = (np.roll(aligned, step, 1) for step in (5, -2))
     assert alignment.cost(aligned, far, 3.0)["predicted_rel"] == pytest.approx(0.3, abs=1e-12)
     assert alignment.cost(aligned, near, 3.0)["predicted_rel"] == pytest.approx(0.0, abs=1e-12)
+    edge = aligned.copy()
+    edge[:, :2] = np.nan  # what a moved frame does not show is no light that moved
+    assert alignment.cost(edge, aligned, 3.0)["predicted_rel"] == 0
 
 
 def test_alignment_can_be_forced_and_forbidden():

@@ -91,13 +91,13 @@ def cost(aligned: np.ndarray, unmoved: np.ndarray, shift: float | None) -> dict[
 
     ``aligned``, ``unmoved``: merged radiance (H, W) or (H, W, 3). Compared on squares of twice the ``shift`` [px]:
     detail that stays within one is blurred, light that leaves it comes from another direction. Half of the sum of
-    differences is what moved, be it from square to square or away.
+    differences is what moved, be it from square to square or away. What one of them does not know is left out of both.
     """
     side = 2 * max(1, round(shift or 0.0))
-    sums = []
+    known, sums = np.isfinite(aligned) & np.isfinite(unmoved), []
     for picture in (aligned, unmoved):
         height, width = picture.shape[0] // side * side, picture.shape[1] // side * side
-        whole = np.nan_to_num(picture[:height, :width], nan=0.0, posinf=0.0, neginf=0.0).astype(float)
+        whole = np.where(known, picture, 0)[:height, :width].astype(float)
         sums.append(whole.reshape(height // side, side, width // side, side, -1).sum((1, 3)))
     light = float(np.abs(sums[0]).sum())
     moved = float(np.abs(sums[1] - sums[0]).sum()) / 2 / light if light > 0 else 0.0
