@@ -45,7 +45,7 @@ def shown(layers: Raster) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     size = [np.sqrt(np.mean(np.square(values), -1, keepdims=True)) for values in (obj, without)]
     hue = np.abs(obj) / np.maximum(size[0], 1e-9)
     change = (layers.rgb("lost") + layers.rgb("gained")) / without
-    by_level = layers["noise.change"][..., None] / np.maximum(size[1], 1e-9) * np.ones(3)
+    by_level = np.broadcast_to(layers["noise.change"][..., None] / np.maximum(size[1], 1e-9), change.shape)
     return {"object": (obj, hue * layers["noise.obj"][..., None]), "shadow": (change, by_level)}
 
 
