@@ -100,7 +100,10 @@ def measured(build: Path, truth_file: Path, shared_truth: Path) -> dict[str, Any
     own = unsure.rgb("of_means").astype(float) ** 2
     modes = [unsure.rgb(f"mode_{name}").astype(float) for name in unsure.attributes["insitu:modes"].split(",")]
     pixels, regions = places(shared_truth)
-    single = {kind: {"error": error[mask].tolist(), "sigma": sigma[mask].tolist()} for kind, mask in pixels.items()}
+    single = {
+        kind: {"error": error[mask].tolist(), "sigma": sigma[mask].tolist(), "level": composite.rgb()[mask].tolist()}
+        for kind, mask in pixels.items()
+    }
     means: dict[str, Any] = {}
     for name, mask in regions.items():
         variance = own[mask].mean(0) / mask.sum()
@@ -112,7 +115,17 @@ def measured(build: Path, truth_file: Path, shared_truth: Path) -> dict[str, Any
     budget = json.loads((build / "uncertainty/budget.json").read_text())
     spent = {path.parent.name: json.loads(path.read_text())["cpu_seconds"] for path in build.glob("*/record.json")}
     seconds = {"all": sum(spent.values()), **{stage: spent[stage] for stage in ("render", "uncertainty")}}
-    return {"scale": scale, "pixels": single, "means": means, "budget": budget["regions"], "cpu_seconds": seconds}
+    return {
+        "scale": scale, "pixels": single, "means": means, "budget": budget["regions"], "cpu_seconds": seconds,
+        "near_field": near_field_bound(build),
+    }  # fmt: skip
+
+
+def near_field_bound(build: Path) -> float:
+    """What a build says, of irradiance, that light from near walls may differ by at the objects; 0 where modelled."""
+    rows = json.loads((build / "probe/record.json").read_text())["evidence"]
+    told = [row for row in rows if row["term"].startswith("near field") and row["modelled"] is False]
+    return max((float(row.get("bound_rel", 0.0)) for row in told), default=0.0)
 
 
 def build_one(scene: Any, pictures: Any, number: int, folder: Path, made_by: str, keep: bool = False) -> None:
@@ -134,6 +147,21 @@ def build_one(scene: Any, pictures: Any, number: int, folder: Path, made_by: str
         say(f"capture {number}: insitu ended with {code}")
     if not keep:
         shutil.rmtree(work)
+
+
+def bounded(records: list[dict[str, Any]]) -> dict[str, float]:
+    """Share of the errors of each kind of place within 1.96 sigma and what the build names as not covered, together."""
+    reach = np.array([record["near_field"] for record in records])[:, None, None]
+    levels = {f"{kind} pixels": [r["pixels"][kind]["level"] for r in records] for kind in ("object", "shadow")}
+    for kind, chosen in (("object means", False), ("shadow means", True)):
+        names = [name for name in records[0]["means"] if name.startswith("shadow_") == chosen]
+        levels[kind] = [[r["means"][name]["level"] for name in names] for r in records]
+    found = {}
+    for place, (error, sigma) in stacked(records).items():
+        if error.size:
+            allowed = QUANTILES["95"] * sigma + reach * np.abs(np.array(levels[place]))
+            found[place] = float((np.abs(error) <= allowed)[np.isfinite(sigma)].mean())
+    return found
 
 
 def stacked(records: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -207,6 +235,8 @@ def judged(records: list[dict[str, Any]]) -> dict[str, Any]:
     seconds = {name: float(np.median([r["cpu_seconds"][name] for r in records])) for name in records[0]["cpu_seconds"]}
     return {
         "captures": len(records), "coverage": summary(records), "regions": by_region(records), "cpu_seconds": seconds,
+        "near_field": [float(v) for v in np.quantile([r["near_field"] for r in records], [0, 0.5, 1])],
+        "bounded": bounded(records),
     }  # fmt: skip
 
 
@@ -276,7 +306,12 @@ def page(found: dict[str, Any], command: str) -> str:
             f"## {kind}", "", f"{KINDS[kind][0].upper()}{KINDS[kind][1:]}. {part['captures']} captures by code",
             f"`{part['code']}`" + (f", {part['left_out']} of other code left out" if part["left_out"] else "")
             + f". CPU seconds, median, on a loaded machine: {seconds}.", "",
-            *table(part["coverage"]), "", *histograms(part["coverage"]),
+            *table(part["coverage"]), "",
+            "Near field, which no sigma holds, as `not_covered` bounds it: "
+            + "{0:.1%} to {2:.1%} of irradiance, {1:.1%} in the".format(*part["near_field"]),
+            "middle. Errors within 1.96 sigma and that bound together: "
+            + ", ".join(f"{place} {share:.1%}" for place, share in part["bounded"].items()) + ".", "",
+            *histograms(part["coverage"]),
             "Per cent of the region's level, RMS over the channels. Bias and scatter are over the captures; *own* is",
             "the part of the stated sigma that is no mode.", "",
             "| region | bias | scatter | stated sigma | own |", "|---|---|---|---|---|",

@@ -46,6 +46,7 @@ MATRICES = np.array(
 )
 SMALLEST = 0.8  # px of a lamp that counts: the simulated picture itself has 8 x 8 samples to a pixel
 COVERED = (6, 10, 14, 18, 25, 50, 200)
+FREEDOM = 8.0  # of Student's likelihood: of 4, 6, 8, 16 that with intervals of 50, 68, 95 % all within 5 % of theirs
 
 
 def tint(kelvin: float) -> np.ndarray:
@@ -114,16 +115,20 @@ def measured(radius_px: float, half: float, soft_px: float, seed: int) -> list[l
 
 
 def fitted(found: np.ndarray) -> tuple[float, float, float]:
-    """POINT, FADES, SPREAD of largest likelihood, errors of red and blue normal."""
+    """POINT, FADES, SPREAD of largest likelihood: errors of red and blue of Student's distribution.
+
+    What lenses differ by makes tails; sigmas of a normal likelihood hold 61 and 76 % where 50 and 68 are said.
+    """
     from scipy.optimize import minimize
 
     covered, error = found[:, 2], found[:, [3, 5]]
 
     def loss(p: np.ndarray) -> float:
-        sigma = np.minimum(np.hypot(np.exp(p[0] - covered * np.exp(p[1])), np.exp(p[2]) / covered), 1)[:, None]
-        return float((np.log(sigma) + (error / sigma) ** 2 / 2).sum())
+        point, edge = np.exp(p[0] - covered * np.exp(p[1])), np.exp(p[2]) * covered**-0.75
+        sigma = np.minimum(np.hypot(point, edge), 1)[:, None]
+        return float((np.log(sigma) + (FREEDOM + 1) / 2 * np.log1p((error / sigma) ** 2 / FREEDOM)).sum())
 
-    point, rate, spread = np.exp(minimize(loss, np.log([7, 0.3, 1.5]), method="Nelder-Mead").x)
+    point, rate, spread = np.exp(minimize(loss, np.log([5, 0.3, 0.5]), method="Nelder-Mead").x)
     return float(point), float(1 / rate), float(spread)
 
 

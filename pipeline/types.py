@@ -255,14 +255,15 @@ class Harmonics(Record):
 
 
 class Emitter(Record):
-    """A compact light: an exact set of texels of the environment. What no emitter holds is the sky."""
+    """A compact light: an exact set of texels of the lighting. What no emitter holds is the sky."""
 
     name: str  # "sun", "lamp_1", ... by falling irradiance
     direction: Array  # (3,), unit, world frame: towards the light, mean weighted by irradiance
     solid_angle_sr: float  # of its texels
     half_angle_rad: float  # of the uniform disc of the same spread
+    half_angle_sigma_rad: float = 0.0  # how much wider it may be, one standard uncertainty
     irradiance: Array  # (3,), ACEScg, of its texels alone on a surface that faces ``direction``
-    texels: Indices  # (N,), flat indices (row * width + column) into the environment, ascending
+    texels: Indices  # (N,), flat indices (row * width + column) into the lighting, ascending
     irradiance_sigma: Array = np.zeros(3)  # (3,) of ``irradiance``
     lower_bound: bool = False  # clipped in every frame, and nothing tells how bright it really is
     evidence: str = "measured"  # or "recovered", or "clipped": where its brightness comes from

@@ -264,7 +264,7 @@ STAGE = Stage(
         "views": A.VIEWS,
         "plane": A.PLANE,
         "albedo": A.ALBEDO,
-        "environment": A.ENVIRONMENT,
+        "environment": A.LIGHTING,
         "emitters": A.EMITTERS,
         "proxies": A.LOCAL_PROXIES,
     },

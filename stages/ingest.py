@@ -270,6 +270,8 @@ def _found(name: str, folders: list[Path], where: str, suffixes: tuple[str, ...]
         problems.append(f"{where}: is {name!r}; expected a {', '.join(suffixes[:-1])} or {suffixes[-1]} file")
     elif path is None:
         problems.append(f"{where}: is {name!r}; no such file in {' or '.join(map(str, dict.fromkeys(folders)))}")
+    elif not os.access(path, os.R_OK):
+        problems.append(f"{where}: is {name!r}, which cannot be read; give it permission ({path})")
     else:
         return path.resolve()
     return None

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.capture.photographs import files_of, read_all
-from pipeline.capture.proposal import ball_names, everything_of, filled, text_of
+from pipeline.capture.proposal import TODO, ball_names, everything_of, filled, text_of
 from pipeline.capture.roles import Proposal, propose
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.manifest import CaptureFacts
@@ -42,7 +42,8 @@ def init(folder: Path, out: Path | None, say: Callable[[str], None]) -> Proposal
     names = ["plate"] * len(proposal.of("plate")) + ball_names(balls, everything_of(proposal))
     for name, shot in zip(names, (*proposal.of("plate"), *balls), strict=True):
         say(f"{name:<8} {len(shot.photos)} frames: {'; '.join(shot.because)}" + (" (unsure)" if shot.unsure else ""))
-    say(f"{out}: {text.count('= ' + chr(34) + 'TODO')} lines to fill in (TODO); then: insitu check {out}")
+    open_lines = sum(f'"{TODO}' in line for line in text.splitlines() if not line.startswith("#"))
+    say(f"{out}: {open_lines} lines to fill in (TODO); then: insitu check {out}")
     return proposal
 
 

@@ -104,6 +104,9 @@ class Lights(Params):
 
     min_share: float = Field(0.02, ge=0.001, le=1, description="least share of the light to be told from sky")
     max_half_angle_deg: float = Field(10.0, gt=0, le=45, description="wider lights stay in the sky [degrees]")
+    width: Literal["unblurred", "seen"] = Field(
+        "unblurred", description="lamps without what the probe's picture spread them, or as wide as it shows them"
+    )
 
 
 class Plane(Params):

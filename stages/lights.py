@@ -1,10 +1,11 @@
 """Find the compact lights of the environment: suns and lamps that cast hard shadows; the rest is sky.
 
 A light is a connected set of the map's texels that stands out sharply, is narrow, and carries a share of the light that
-matters (`pipeline.light.emitters`). Nothing is fitted or moved: the light of a group is the map on its texels, so that
-lights and sky sum to the map exactly, and what the probe measured stays what is rendered. What was clipped and not
-recovered is said to be a lower bound. Limits: a lamp is as sharp as the probe saw it; light is distant; windows and
-tubes that are wide stay in the sky, which the renderer samples by brightness.
+matters (`pipeline.light.emitters`). The light of a group is the map on its texels, so that lights and sky sum to the
+map exactly. A lamp that was measured is drawn as wide as it is, without what the probe's picture spread it
+(`pipeline.light.narrowing`): that moves its light by about a pixel of that picture, and adds and loses none. What was
+clipped and not recovered is said to be a lower bound. Limits: light is distant; windows and tubes that are wide stay in
+the sky, as blurred as the probe saw them, which the renderer samples by brightness.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from pipeline.light.alike import flux_sigma
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.environment import total_energy
-from pipeline.run.artifacts import EMITTERS, ENVIRONMENT
+from pipeline.light.narrowing import drawn, half_angle_of, spread_of
+from pipeline.run.artifacts import EMITTERS, ENVIRONMENT, LIGHTING
 from pipeline.run.evidence import TRIED
 from pipeline.run.stage import Stage
 from pipeline.types import Emitter, Raster, Result
@@ -29,13 +31,18 @@ COSTS = {
     "recovered": "its sigma: it was clipped, and its flux comes from what it does to known surfaces",
     "clipped": "all that it is brighter than its clipped value",
 }
+STAYS = {  # why a lamp is as wide as the map has it
+    "recovered": "its shadow's edge tells how wide it is, where it is wide enough to tell",
+    "clipped": "clipped in its middle: its moments do not tell how wide it is",
+}
+RENDERED = {*"RGB", *(f"variance.{channel}" for channel in "RGB"), "seen"}
 # A sun, by what no lamp in a room is at once: the only light, above, a disc of half a degree as a probe blurs it, and
 # brighter than the mean of all else by this.
 SUN_HALF_ANGLE_DEG, SUN_CONTRAST = 2.0, 100.0
 
 
 def compute(environment: Raster, params: knobs.Lights) -> Result:
-    """Compact lights of the map, strongest first; an empty list when the map is all sky."""
+    """Compact lights of the map, strongest first, and what renders; an empty list when the map is all sky."""
     rgb = environment.rgb()
     found, wide = lights(rgb, params.min_share, np.radians(params.max_half_angle_deg))
     kept, rest = found[:MOST], found[MOST:]
@@ -49,18 +56,29 @@ def compute(environment: Raster, params: knobs.Lights) -> Result:
         )
         for number, patch in enumerate(kept, 1)
     ]  # fmt: skip
+    spread = spread_of(environment)
+    lit = drawn(lighting(environment), emitters, spread if params.width == "unblurred" else 0.0)
     numbers = {
         emitter.name: {
-            "share": patch.share, "half_angle_deg": float(np.degrees(patch.half_angle_rad)), **angles(patch),
+            "share": patch.share, "half_angle_deg": float(np.degrees(true.half_angle_rad)),
+            "half_angle_sigma_deg": float(np.degrees(true.half_angle_sigma_rad)),
+            "seen_half_angle_deg": float(np.degrees(patch.half_angle_rad)), **angles(patch),
             "irradiance": patch.irradiance.tolist(), "texels": len(patch.texels),
             "irradiance_sigma": emitter.irradiance_sigma.tolist(), "lower_bound": emitter.lower_bound,
         }
-        for emitter, patch in zip(emitters, kept, strict=True)
+        for emitter, true, patch in zip(emitters, lit.emitters, kept, strict=True)
     }  # fmt: skip
     numbers["sky"] = {"share": 1 - sum(patch.share for patch in kept)}
     warnings = [f"{name(patch)} is left in the sky: only the {MOST} strongest lights are told apart" for patch in rest]
     warnings += [f"{one.name} is clipped: its irradiance is a lower bound" for one in emitters if one.lower_bound]
-    return Result({"emitters": emitters}, numbers, warnings, evidence(emitters, kept, wide, params))
+    rows = evidence(emitters, kept, wide, params) + widths(lit.emitters, kept, spread, params.width)
+    return Result({"emitters": lit.emitters, "lighting": lit.environment}, numbers, warnings, rows)
+
+
+def lighting(environment: Raster) -> Raster:
+    """What of the map the later stages ask for."""
+    channels = {name: values for name, values in environment.channels.items() if name in RENDERED}
+    return Raster(channels, environment.space, environment.attributes)
 
 
 def source(environment: Raster, patch: Patch) -> str:
@@ -132,6 +150,32 @@ def evidence(
     return rows
 
 
+def widths(lamps: list[Emitter], found: list[Patch], spread_rad: float, width: str) -> list[dict[str, Any]]:
+    """Why each lamp is as wide as it is drawn; nothing of a map that no picture spread (``spread_rad`` = 0)."""
+    rows: list[dict[str, Any]] = []
+    for lamp, patch in zip(lamps, found, strict=True) if spread_rad > 0 else ():
+        moved = width == "unblurred" and lamp.evidence == "measured"
+        true = lamp.half_angle_rad if moved else half_angle_of(patch.half_angle_rad, spread_rad)
+        seen_as = np.hypot(true, 2 * spread_rad) if moved else patch.half_angle_rad
+        # Two distributions about one point whose widths have the ratio c differ by at most (1 - c) / 2 beyond an edge.
+        ratio = true / max(seen_as, 1e-9)
+        told = (
+            f"half angle {np.degrees(seen_as):.2f} degrees in a picture that spreads points by "
+            f"{np.degrees(spread_rad):.2f}"
+        )
+        if moved:
+            because = f"{told}: {np.degrees(true):.2f} +- {np.degrees(lamp.half_angle_sigma_rad):.2f}"
+        else:
+            because = STAYS.get(lamp.evidence, f"knob lights.width = {width}; {told}")
+        rows.append({
+            "term": f"width of {lamp.name} without the picture's spread", "modelled": moved, "because": because,
+            "could_cost": f"{(1 - ratio) / 2:.0%} of its light where its shadow ends",
+            **({} if moved else {"bound_rel": (1 - ratio) / 2 * patch.share}),
+        })  # fmt: skip
+    return rows
+
+
 STAGE = Stage(
-    "lights", compute, knobs.Lights, inputs={"environment": ENVIRONMENT}, outputs={"emitters": EMITTERS}
+    "lights", compute, knobs.Lights, inputs={"environment": ENVIRONMENT},
+    outputs={"emitters": EMITTERS, "lighting": LIGHTING},
 )  # fmt: skip

@@ -29,8 +29,8 @@ from pipeline.run.artifacts import (
     CAMERA,
     CLOUD,
     EMITTERS,
-    ENVIRONMENT,
     FACTS,
+    LIGHTING,
     PLANE,
     PROXIES,
     SURROUNDINGS,
@@ -366,7 +366,7 @@ STAGE = Stage(
     knobs.Plane,
     {
         "facts": FACTS, "wishes": WISHES, "camera": CAMERA, "views": VIEWS, "cloud": CLOUD,
-        "environment": ENVIRONMENT, "emitters": EMITTERS, "proxies": PROXIES,
+        "environment": LIGHTING, "emitters": EMITTERS, "proxies": PROXIES,
     },
     {"plane": PLANE, "surroundings": SURROUNDINGS},
 )  # fmt: skip

@@ -254,7 +254,7 @@ STAGE = Stage(
         "photographs": A.PHOTOGRAPHS,
         "camera": A.CAMERA,
         "views": A.VIEWS,
-        "environment": A.ENVIRONMENT,
+        "environment": A.LIGHTING,
         "emitters": A.EMITTERS,
         "plane": A.PLANE,
         "proxies": A.SURROUNDINGS,

@@ -388,7 +388,7 @@ STAGE = Stage(
         "camera": A.CAMERA,
         "views": A.VIEWS,
         "photographs": A.PHOTOGRAPHS,
-        "environment": A.ENVIRONMENT,
+        "environment": A.LIGHTING,
         "emitters": A.EMITTERS,
         "plane": A.PLANE,
         "albedo": A.ALBEDO,

@@ -228,11 +228,11 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             seen = studio.seen(pattern.radiance, [pattern.emitter] if pattern.emitter else [])
             change = response.of_light(seen, studio.upward(pattern.radiance) / studio.irradiance)
         elif pattern.lamps is not None:
-            narrow = pattern.lamps
+            wide = pattern.lamps
             # Of shadows alone: a highlight narrower than the grid's squares would be met by chance, and keeps its sum.
-            lost = studio.seen(narrow.rgb, narrow.emitters).lost - whole.lost
+            lost = studio.seen(wide.rgb, wide.emitters).lost - whole.lost
             apart = Seen(lost, np.zeros_like(lost), np.zeros_like(lost))
-            share = (studio.upward(narrow.rgb) - studio.irradiance) / studio.irradiance
+            share = (studio.upward(wide.rgb) - studio.irradiance) / studio.irradiance
             change = response.of_turn(apart, share)
         else:
             assert pattern.turn is not None
@@ -252,7 +252,8 @@ def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
     for emitter in studio.emitters:
         alone = np.zeros((*studio.rgb.shape[:2], 1))
         alone.reshape(-1)[np.asarray(emitter.texels, int)] = 1.0
-        texels = np.flatnonzero(light.turned(alone, turn)[..., 0] > 0.5)
+        covered = light.turned(alone, turn)[..., 0]
+        texels = np.flatnonzero(covered > 0.5 * covered.max())  # a lamp of one texel may lie on four by a quarter each
         moved.append(emitter.model_copy(update={"texels": texels}))
     return moved
 
@@ -298,7 +299,7 @@ STAGE = Stage(
     knobs.Uncertainty,
     inputs={
         "wishes": A.WISHES, "camera": A.CAMERA, "views": A.VIEWS, "photographs": A.PHOTOGRAPHS, "balance": A.BALANCE,
-        "balls": A.BALLS, "environment": A.ENVIRONMENT, "emitters": A.EMITTERS, "plane": A.PLANE, "albedo": A.ALBEDO,
+        "balls": A.BALLS, "environment": A.LIGHTING, "emitters": A.EMITTERS, "plane": A.PLANE, "albedo": A.ALBEDO,
         "surface": A.SURFACE, "local_proxies": A.LOCAL_PROXIES, "occluders": A.OCCLUDERS, "layers": A.LAYERS,
         "composite": A.COMPOSITE, "records": A.RECORDS,
     },

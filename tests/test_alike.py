@@ -157,14 +157,45 @@ def errors(radius_px: int, half_angle_deg: float, method: Method, seeds: int = 2
 def test_flux_of_a_lamp_is_off_by_what_it_states(radius_px, half_angle_deg):
     """Lamps of 20 pixels, lens and pixel 0.65 px together, in the middle of what the law is for.
 
-    Measured over 14 lamps each, rms of error over sigma: 0.76 and 0.76; over the law's own 456 lamps at this softness
-    1.1 (`benchmarks.sampled_lamps`). Red and blue err together, so 28 independent numbers: an rms scatters by a factor
-    of 1 / sqrt(56) = 0.13, twice as much for tails as heavy as these. 0.8 less two of them, 1.1 and two more.
+    Measured over 14 lamps each, rms of error over sigma: 1.02 and 1.02; over the law's own lamps at this softness 1.2
+    (`benchmarks.sampled_lamps`). Red and blue err together, so 28 independent numbers: an rms scatters by a factor of
+    1 / sqrt(56) = 0.13, twice as much for tails as heavy as these. 1.0 less two of them, 1.2 and two more.
     """
     z = errors(radius_px, half_angle_deg, "bilinear")
     assert len(z) >= 10
-    assert 0.4 < np.sqrt((z**2).mean()) < 1.6
+    assert 0.5 < np.sqrt((z**2).mean()) < 1.8
     assert (np.abs(z) < 2).mean() > 0.9
+
+
+def off_by_photosites(area_px: float, soft_px: float) -> tuple[np.ndarray, float]:
+    """Relative errors (16, 16) of a white disc's light by every other photosite of every other row, and its pixels.
+
+    ``soft_px``: lens and pixel. A photosite is a pixel's whole area, which is in the softness; phases go in 1/8 px.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    fine, period, cells = 8, 16, 16
+    y, x = np.mgrid[: period * cells, : period * cells] - (period * cells - 1) / 2
+    disc = (np.hypot(x, y) < fine * np.sqrt(area_px / np.pi)).astype(float)
+    picture = gaussian_filter(disc, fine * soft_px)
+    sums = picture.reshape(cells, period, cells, period).sum((0, 2))
+    return sums / sums.mean() - 1, picture.sum() ** 2 / (picture**2).sum() / fine**2
+
+
+@pytest.mark.parametrize("area_px", [20, 40, 80, 160])
+def test_the_law_falls_with_the_area_as_photosites_sample_a_disc(area_px):
+    """A white disc's own sampling, without what colours that mix add to it: less than stated, at the sharpest lens too.
+
+    Of nine discs over an octave of area, rms over all phases. Measured at 0.55 px: 0.69 to 0.86 of what is stated, over
+    four octaves; at 0.85 px 0.09 to 0.12. Matrices of the law's cameras multiply the error of a neutral lamp's red and
+    blue by 1.0 to 1.3, of a warm one's blue by more: so at least half, and no more than all.
+    """
+    over = {}
+    for soft_px in (0.55, 0.85):
+        discs = [off_by_photosites(area, soft_px) for area in np.geomspace(area_px, 2 * area_px, 9)]
+        over[soft_px] = np.sqrt(np.mean([(error / alike.sampled(pixels)[0]) ** 2 for error, pixels in discs]))
+    assert 0.5 < over[0.55] < 1
+    assert over[0.85] < 0.2
 
 
 def test_sampling_counts_the_pixels_that_a_lamp_covers():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -107,7 +108,7 @@ def test_every_problem_of_the_texts_at_once(wrong, capsys):
 @pytest.mark.parametrize(
     ("switch", "says"),
     [
-        (("--set", "render.samples=0"), "--set: render.samples: is 0; expected"),
+        (("--set", "render.samples=0"), "--set: render.samples: is 0; expected: greater than or equal to 1"),
         (("--set", "render.smaples=4"), "did you mean samples"),
         (("--set", "rendersamples"), "expected stage.knob=value"),
         (("--set", "composite.exposure_ev=NaN"), "composite.exposure_ev: is nan"),
@@ -193,6 +194,50 @@ def test_composite_takes_the_switches_for_looking(desk_build, tmp_path):
 def test_manifest_that_is_no_toml_or_empty(text, capsys, tmp_path):
     (tmp_path / "capture.toml").write_bytes(text.encode("latin1"))
     assert "capture.toml" in refused(capsys, 2, "run", tmp_path)[0]
+
+
+def test_manifest_in_another_encoding_is_refused_by_its_line(capsys, tmp_path):
+    (tmp_path / "capture.toml").write_bytes('name = "desk"\n# café\n'.encode("latin1"))
+    (line,) = refused(capsys, 2, "run", tmp_path)
+    assert line == f"{tmp_path}/capture.toml:2: not valid TOML: byte 0xe9 is no UTF-8; save it as UTF-8"
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """Makes one file refuse to be opened, which the modes of a file do not do to the superuser."""
+
+    def close(name: str) -> None:
+        def refuse(path: Path, *args: object, **options: object) -> object:
+            if path.name == name:
+                raise PermissionError(errno.EACCES, "Permission denied", str(path))
+            return open_path(path, *args, **options)
+
+        open_path, access = Path.open, os.access
+        monkeypatch.setattr(Path, "open", refuse)
+        monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != name and access(path, mode))
+
+    return close
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "says"),
+    [
+        ("capture.toml", 2, "capture.toml: cannot be read (Permission denied)"),
+        ("scene.toml", 2, "scene.toml: cannot be read (Permission denied)"),
+        ("cube.obj", 2, "object[0].file: is 'cube.obj', which cannot be read"),
+        ("plate.dng", 3, "plate.dng: cannot be read (Permission denied)"),
+        ("truth.json", 4, "truth.json: Permission denied, needed to read or write it"),
+    ],
+)
+def test_file_that_may_not_be_read(name, code, says, closed, capsys, tmp_path):
+    folder = tiny(tmp_path, scene=OBJECT.format(x=0, z=0))
+    (folder / "capture.toml").write_text('truth = "truth/truth.json"\n' + (folder / "capture.toml").read_text())
+    (folder / "truth").mkdir()  # by itself: every file beside truth.json is part of the truth
+    (folder / "truth" / "truth.json").write_text("{}")
+    (folder / "cube.obj").write_text(CUBE)
+    closed(name)
+    lines = refused(capsys, code, "run", folder, "--upto", "ingest", "--out", tmp_path / "out")
+    assert any(says in line for line in lines)
 
 
 def test_folder_without_manifest(capsys, tmp_path):
@@ -330,7 +375,7 @@ def test_object_behind_the_camera(capsys, tmp_path):
     folder = tiny(tmp_path, GIVEN, OBJECT.format(x=0.1, z=5.0))
     (folder / "cube.obj").write_text(CUBE)
     (line,) = refused(capsys, 2, "run", folder, "--upto", "plane", "--out", tmp_path / "out")
-    assert line.startswith("object cube: position_m is (0.1, 5), which is behind the plate camera")
+    assert line.startswith("object cube: position_m is (0.1, 5) m, which is behind the plate camera")
 
 
 def glb(document: dict) -> bytes:

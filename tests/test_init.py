@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import DESK, dng, refused
+from command import DESK, SAMPLES, dng, refused, tiny
 from small_photos import photo, place, with_disc
 
 from pipeline.camera.board_families import Markers, charuco_centres, layout_of, proposed_dictionary
@@ -19,6 +20,7 @@ from pipeline.capture.likeness import cells_of, compare, compare_moved
 from pipeline.capture.photographs import binned, combined, files_of, read_all, reduced
 from pipeline.capture.proposal import filled, text_of
 from pipeline.capture.roles import propose
+from pipeline.run.cli import main
 from pipeline.run.errors import CaptureError, ManifestError
 from pipeline.run.manifest import CaptureFacts, load_capture
 from pipeline.types import Frame
@@ -232,6 +234,62 @@ def test_a_folder_with_little_is_proposed_all_the_same():
     assert facts.plate.files == ["a/*.dng"]
     assert "b.dng: not read" in text
     assert 'files = ["TODO' in text  # the ball
+
+
+def test_a_plate_that_a_board_fills_is_told_by_the_ball_that_stood_there(tmp_path, capsys):
+    """The board's markers span 11 % of the corner's plate, as on photographs of a board."""
+    corner = SAMPLES / "corner"
+    for name in ("plate", "ball_a"):
+        shutil.copytree(corner / name, tmp_path / name)
+    assert main(["init", str(tmp_path), "-o", str(tmp_path / "capture.toml")]) == 0
+    text = (tmp_path / "capture.toml").read_text()
+    assert f"{sum('TODO' in line for line in text.splitlines()[2:])} lines to fill in" in capsys.readouterr().out
+    facts = CaptureFacts.model_validate(filled(tomllib.loads(text)))
+    assert facts.plate.files == ["plate/*.dng"]
+    assert [(ball.name, ball.tripod) for ball in facts.ball] == [("ball_a", True)]
+    assert facts.camera.calibration == []
+
+
+def test_files_still_to_be_named_are_said_so(tmp_path, capsys):
+    folder = tiny(tmp_path)
+    text = (folder / "capture.toml").read_text()
+    (folder / "capture.toml").write_text(text.replace('["plate.dng"]', '["TODO: the bracket without the ball"]'))
+    (line,) = refused(capsys, 2, "run", folder, "--upto", "ingest", "--out", tmp_path / "out")
+    assert line.endswith("capture.toml: plate.files: still to be filled in: the bracket without the ball")
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('fx = "TODO px"', "fx is 'TODO px'; expected pixels above 0"),
+        ("fx = nan", "fx is nan; expected pixels above 0"),
+        ("width = 128.5", "width is 128.5; expected whole pixels above 0"),
+        ("distortion = [0.1, inf]", "distortion is [0.1, inf]; expected finite numbers"),
+        ("distortion_model = [1.0]", "distortion_model is [1.0]; expected a name"),
+    ],
+)
+def test_camera_numbers_that_are_none_are_refused_before_anything_runs(line, says, tmp_path, capsys):
+    """As `init` leaves the lens where no board photographs tell it."""
+    folder = tiny(tmp_path)
+    text = (folder / "capture.toml").read_text()
+    key = line.split(" ")[0]
+    kept = [one for one in text.splitlines() if not one.startswith(f"{key} ")]
+    kept.insert(kept.index("[camera.given]") + 1, line)
+    (folder / "capture.toml").write_text("\n".join(kept))
+    (found,) = refused(capsys, 2, "run", folder, "--out", tmp_path / "out")
+    assert found.endswith(f"capture.toml:{kept.index('[camera.given]') + 1}: camera.given: {says}")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("line", ["yaw_deg = inf", "lift_m = nan", "scale = inf", "position_m = [nan, 0.1]"])
+def test_wishes_that_are_no_finite_number_are_refused_before_anything_runs(line, tmp_path, capsys):
+    kept = [one for one in ("position_m = [0.1, 0.1]",) if one.split()[0] != line.split()[0]]
+    scene = "\n".join(["[[object]]", 'name = "cube"', 'file = "cube.obj"', line, *kept])
+    folder = tiny(tmp_path, scene=scene)
+    (found,) = refused(capsys, 2, "run", folder, "--out", tmp_path / "out")
+    assert f"scene.toml:4: object[0].{line.split()[0]}" in found
+    assert found.endswith("expected: a finite number")
+    assert not (tmp_path / "out").exists()
 
 
 def folder_groups(name: str) -> list[list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -220,13 +221,16 @@ def test_a_small_picture_sees_the_same():
 
 def test_a_coarser_map_has_the_same_light_and_the_same_texels():
     light = staged.artifacts()["environment"]
-    coarse = pilot.coarser(light)
+    coarse = pilot.coarser(light, [])
     assert coarse.shape == light.shape
     means = [one.rgb().astype(float).mean((0, 1)) for one in (coarse, light)]
     assert means[0] == pytest.approx(means[1], rel=1e-6)
     assert (coarse.rgb()[::2] == coarse.rgb()[1::2]).all()
     odd = Raster({"Y": np.arange(15.0).reshape(3, 5).astype(np.float32)}, "data")
-    assert pilot.coarser(odd).shape == (3, 5)
+    assert pilot.coarser(odd, []).shape == (3, 5)
+    texels = np.array([9, 10])
+    kept = pilot.coarser(light, [SimpleNamespace(texels=texels)])
+    assert (kept.rgb().reshape(-1, 3)[texels] == light.rgb().reshape(-1, 3)[texels]).all()
     masked = Raster({"mask": np.array([[0, 8], [1, 0]], np.uint32)}, "data")
     assert pilot.shrunk(masked, 2)["mask"] == [[8]]
 

@@ -44,6 +44,23 @@ def test_a_capture_without_truth_is_refused_by_the_option_that_asks_for_it(names
         waterfall(build, names, str, terms)
 
 
+def test_rows_of_both_questions_are_kept_while_composite_and_truth_stay(desk_build, tmp_path, monkeypatch):
+    build = Build(graph(), tmp_path, settings.load(desk_build), KNOBS)
+    composite = {"outputs": {"composite": "one"}}
+    monkeypatch.setattr(build, "record", lambda name: composite)
+    build.keep_waterfall({"nothing": {"e": 0.5}, "without sun": {"e": 0.9}})
+    build.keep_waterfall({"nothing": {"e": 0.5}, "probe": {"e": 0.3}})
+    build.keep_waterfall({"nothing": {"e": 0.5}, "probe": {"e": 0.2}})  # asked again: the new row
+    rows = {"nothing": {"e": 0.5}, "probe": {"e": 0.2}, "without sun": {"e": 0.9}}
+    assert build.waterfall() == rows
+    assert list(build.waterfall()) == list(rows)
+    build.keep_waterfall({"nothing": {"e": 0.4}, "pose": {"e": 0.3}})  # another truth
+    assert list(build.waterfall()) == ["nothing", "pose"]
+    composite["outputs"]["composite"] = "two"
+    build.keep_waterfall({"nothing": {"e": 0.4}, "albedo": {"e": 0.1}})
+    assert list(build.waterfall()) == ["nothing", "albedo"]
+
+
 def test_environment_is_turned_and_scaled():
     """A map whose centre looks along +X of the world, under a rotation; the plate's unit is twice the truth's."""
     light = np.zeros((8, 16, 3), np.float32)

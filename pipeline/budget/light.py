@@ -4,8 +4,8 @@ The map's stated variance has four parts with different shapes. What all texels 
 and probe, reflectance of the ball). An emitter's *flux* is its own, as sure as it states. The rest of the sky is taken
 in six smooth *lobes*, the squares of the direction's components, which sum to 1: errors of texels are alike within a
 few pixels of the probe's picture (`pipeline.light.alike`). What no view saw moves as one, *unseen*. A wrong centre of
-the ball or a wrong pose of the camera turns the whole map: three *turns*. The probe's picture shows every lamp wider
-than it is, which softens its shadows: all lamps at once as narrow as they may be are one *width*. Which of them the
+the ball or a wrong pose of the camera turns the whole map: three *turns*. How much the probe's picture widened lamps,
+and so how soft their shadows are, is known to some percent: all lamps wider at once are one *width*. Which of them the
 composite can notice is bounded by the irradiance they carry to the plane and to the six sides of an object; those that
 together stay below a share of the variance are left out, and said.
 """
@@ -18,16 +18,12 @@ import numpy as np
 
 from pipeline.camera.rigid import rotation_exp, skew
 from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
-from pipeline.light.alike import ALIKE, ALIKE_PX, alike_rows, cell_sums, own_sigma
+from pipeline.light.alike import alike_rows, cell_sums, own_sigma
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment, total_energy
+from pipeline.light.narrowing import widened
 from pipeline.types import BallFit, Emitter, Raster, View
 
 BOUND_MAP = (64, 128)  # of the maps whose irradiance bounds a pattern
-# Standard deviation along an axis of what a point becomes in a map, in pixels of the probe's picture: the pixel's box,
-# the lens, demosaicking and the texels it is spread over. From the moments of six lamps of 4 and 7 degrees whose true
-# widths are known, in balls of 43 and 87 px: 0.94 to 1.14.
-SPREAD_PX = 1.0
-FINE = 1024  # columns, at least, of the map that lamps are drawn narrower in
 UNSEEN = 0.25  # coverage below which a texel was filled in, as the probe stage has it
 
 
@@ -175,57 +171,23 @@ def turned(rgb: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.asarray(result * np.divide(total_energy(rgb), energy, out=np.ones(len(energy)), where=energy > 0))
 
 
-def narrow_half_angle(emitter: Emitter, spread_rad: float) -> float:
-    """Half angle [rad] of the disc that a picture which spreads points by ``spread_rad`` shows as the emitter.
-
-    Second moments add: a disc of half angle a has a^2 / 4 along each axis. Zero for what may be a point.
-    """
-    return float(np.sqrt(max(emitter.half_angle_rad**2 - 4 * spread_rad**2, 0)))
-
-
-def narrowed(rgb: np.ndarray, emitters: list[Emitter], spread_rad: float) -> Lamps:
-    """All emitters of a map (H, W, 3) as discs of the same irradiance without the picture's spread, on a finer map.
-
-    Their texels keep the least radiance among them; what exceeds it moves into the disc, at least two texels wide.
-    """
-    height, width = rgb.shape[:2]
-    split = max(1, -(-FINE // width))
-    fine = np.repeat(np.repeat(np.asarray(rgb, float), split, 0), split, 1)
-    flat, solid = fine.reshape(-1, 3), latlong_solid_angles(height * split, width * split).reshape(-1, 1)
-    directions, moved = latlong_directions(height * split, width * split).reshape(-1, 3), []
-    coarse = np.arange(height * width).reshape(height, width)
-    index = np.repeat(np.repeat(coarse, split, 0), split, 1).ravel()
-    for emitter in emitters:
-        inside = np.flatnonzero(np.isin(index, np.asarray(emitter.texels, int)))
-        cosine = solid * np.maximum(directions @ emitter.direction, 0)[:, None]
-        least = flat[inside].min(0)
-        excess = (cosine[inside] * (flat[inside] - least)).sum(0)
-        radius = max(narrow_half_angle(emitter, spread_rad), np.pi / (height * split))
-        disc = np.flatnonzero(directions @ emitter.direction >= np.cos(radius))
-        flat[inside] = least
-        flat[disc] += excess / cosine[disc].sum(0)
-        moved.append(emitter.model_copy(update={"texels": disc}))
-    return Lamps(fine, moved)
-
-
 def width_patterns(environment: Raster, emitters: list[Emitter]) -> list[Pattern]:
-    """All lamps as narrow as the probe's picture lets them be; none where the map names no picture.
+    """All lamps wider by one sigma of their half angles, which one lens spread alike; none where none is unsure.
 
-    A known blur that nothing undoes: its whole effect stands as the standard uncertainty (GUM F.2.4.5). Two
-    distributions whose widths have the ratio c, about one point, differ by at most (1 - c) / 2 in what lies on one side
-    of an edge, so by that share of a lamp's light in its penumbra.
+    Two distributions whose widths have the ratio c, about one point, differ by at most (1 - c) / 2 in what lies on one
+    side of an edge, so by that share of a lamp's light in its penumbra.
     """
-    if ALIKE not in environment.attributes or not emitters:
+    if not any(emitter.half_angle_sigma_rad > 0 for emitter in emitters):
         return []
     rgb = environment.rgb().astype(float)
-    spread = SPREAD_PX * np.radians(float(environment.attributes[ALIKE])) / ALIKE_PX
     lost = np.zeros(rgb.shape)
     for emitter in emitters:
-        ratio = narrow_half_angle(emitter, spread) / max(emitter.half_angle_rad, 1e-9)
+        wide = emitter.half_angle_rad + emitter.half_angle_sigma_rad
+        ratio = emitter.half_angle_rad / max(wide, 1e-9)
         texels = np.asarray(emitter.texels, int)
         lost.reshape(-1, 3)[texels] = (1 - ratio) / 2 * rgb.reshape(-1, 3)[texels]
     bound = relative_change(sides(lost), sides(np.maximum(rgb, 0)))
-    return [Pattern("width", "width", bound, lamps=narrowed(rgb, emitters, spread))]
+    return [Pattern("width", "width", bound, lamps=Lamps(*widened(rgb, emitters)))]
 
 
 def relative_change(change: np.ndarray, level: np.ndarray) -> float:

@@ -92,7 +92,7 @@ def check_feet(feet: dict[str, np.ndarray], camera: Camera, view: View) -> list[
     frame = np.array([camera.width, camera.height])
     for name, foot in feet.items():
         x, y, z = camera_points(view.world_from_camera, foot[None])[0][0]
-        where = f"object {name}: position_m is ({foot[0]:g}, {foot[2]:g})"
+        where = f"object {name}: position_m is ({foot[0]:g}, {foot[2]:g}) m"
         if z <= 0:
             problems.append(f"{where}, which is behind the plate camera; expected a place in front of it")
             continue

@@ -192,10 +192,13 @@ def with_plate(shots: list[Shot]) -> list[Shot]:
     scores = []
     largest = max(shot.first.frame.width * shot.first.frame.height for shot in shots)
     for shot in shots:
-        if shot.role != "left" or area(shot) >= BOARD_AREA:
+        close = area(shot) >= BOARD_AREA
+        if shot.role != "left" or (close and len(shot.photos) < 2):
             continue
         likes = [like for ball in balls if (like := alike(shot, ball)) is not None]
         same = [like for like in likes if like.same_view]
+        if close and not same:  # a board that fills this much of a plate is told by the ball that stood there, too
+            continue
         reasons, score = [], 0.0
         if same:
             score += 4

@@ -91,6 +91,8 @@ def read_metadata(path: Path, name: str = "") -> Frame:
                 own = _dng_facts(name, path, tiff, pages) if is_dng else _other_facts(name, path, tiff, pages)
                 facts |= {**own, **exif_exposure(main), "camera": camera_name(main)}
         return Frame(**facts, file=name, sha256=file_sha256(path))
+    except PermissionError as error:
+        raise CaptureError(f"{name}: cannot be read ({error.strerror}); give it permission") from error
     except DAMAGE as error:
         raise _damaged(name, error) from error
     except Exception as error:  # tifffile's own error derives from Exception alone

@@ -89,9 +89,17 @@ HARMONICS = Artifact(
 EMITTERS = Artifact(
     "emitters",
     "json",
-    "compact lights as sets of texels of the environment, strongest first; the other texels are the sky",
+    "compact lights as sets of texels of the lighting, strongest first; the other texels are the sky",
     RADIANCE_UNIT,
     type=list[Emitter],
+)
+LIGHTING = Artifact(
+    "lighting",
+    "raster",
+    "the environment with its lamps as wide as they are, which is what renders: R G B, variance.RGB, seen; finer than "
+    "the environment where lamps ask for it, and the environment itself where none was narrowed",
+    RADIANCE_UNIT,
+    ACESCG,
 )
 
 PLANE = Artifact("plane", "json", "plane of the local scene and its modelled rectangle", "m", type=Plane)

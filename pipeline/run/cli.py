@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import pipeline
 from pipeline.run import closure
-from pipeline.run.errors import InsituError, ManifestError
+from pipeline.run.errors import ArtifactError, InsituError, ManifestError
 
 if TYPE_CHECKING:
     from pipeline.run.runner import Build
@@ -164,6 +164,9 @@ def main(argv: list[str] | None = None) -> int:
         for line in str(error).splitlines() or [repr(error)]:
             say(f"insitu: {line}", stream=sys.stderr)
         return error.exit_code
+    except PermissionError as error:  # of a file that none of the readers expects to be closed to it
+        say(f"insitu: {error.filename}: {error.strerror}, needed to read or write it; allow that", stream=sys.stderr)
+        return ArtifactError.exit_code
     except KeyboardInterrupt:
         say("insitu: interrupted; finished stages are kept, run the same command to go on", stream=sys.stderr)
         return 130

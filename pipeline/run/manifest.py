@@ -6,9 +6,11 @@ Imports no numpy: a refused manifest answers at once.
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +32,22 @@ class PlateFacts(Strict):
     files: list[str] = Field(min_length=1, description="RAW files or globs, relative to root")
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+# What a key of [camera.given] must be, in words and as a test of what TOML held.
+PIXELS = ("whole pixels above 0", lambda value: _is_number(value) and value > 0 and value % 1 == 0)
+FOCAL = ("pixels above 0", lambda value: _is_number(value) and value > 0)
+PLACE = ("a finite number", _is_number)
+BEND = ("finite numbers", lambda value: all(map(_is_number, value if isinstance(value, list) else [value])))
+NAME = ("a name", lambda value: isinstance(value, str))
+GIVEN: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "width": PIXELS, "height": PIXELS, "fx": FOCAL, "fy": FOCAL, "cx": PLACE, "cy": PLACE, "distortion": BEND,
+    "distortion_model": NAME,
+}  # fmt: skip
+
+
 class CameraFacts(Strict):
     """Where the intrinsics come from: board photographs, given numbers (pixel origin of conventions), a camera.json."""
 
@@ -38,6 +56,19 @@ class CameraFacts(Strict):
         None, description="width height fx fy cx cy [distortion [distortion_model: brown, rational or fisheye]]"
     )
     file: str | None = Field(None, description="camera.json of a former build, same optics; relative to capture.toml")
+
+    @field_validator("given", mode="before")
+    @classmethod
+    def _numbers(cls, given: Any) -> Any:
+        """What `pipeline.camera.given_camera` computes with is of its kind; which keys it wants, it says itself."""
+        wrong = [
+            f"{key} is {value!r}; expected {GIVEN[key][0]}"
+            for key, value in (given.items() if isinstance(given, dict) else ())
+            if key in GIVEN and not GIVEN[key][1](value)
+        ]
+        if wrong:
+            raise ValueError(". ".join(wrong))
+        return given
 
     @model_validator(mode="after")
     def _one_source(self) -> CameraFacts:
@@ -304,13 +335,21 @@ MEANT = {"height_m": ("lift_m",), "y_m": ("lift_m",), "rotation_deg": ("yaw_deg"
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises ManifestError when it is missing or not TOML."""
+    """Parse a TOML file. Raises ManifestError when it is missing, not TOML, or not to be read."""
     if not path.is_file():
         raise ManifestError(f"{path}: no such file")
     try:
-        return tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content = path.read_bytes()
+        return tomllib.loads(content.decode("utf-8"))
+    except tomllib.TOMLDecodeError as error:
         raise ManifestError(f"{path}: not valid TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        line, byte = content[: error.start].count(b"\n") + 1, content[error.start]
+        raise ManifestError(
+            f"{path}:{line}: not valid TOML: byte 0x{byte:02x} is no UTF-8; save it as UTF-8"
+        ) from error
+    except OSError as error:
+        raise ManifestError(f"{path}: cannot be read ({error.strerror}); give it permission") from error
 
 
 def problems_of(error: ValidationError, path: Path, model: type[BaseModel], prefix: str = "") -> list[str]:
@@ -337,7 +376,8 @@ def problems_of(error: ValidationError, path: Path, model: type[BaseModel], pref
             stated = item["input"].get("kind") if isinstance(item["input"], dict) else item["input"]
             lines.append(f"{where}: is {stated!r}; {item['msg']}")
         else:
-            message = item["msg"].removeprefix("Value error, ")
+            message = item["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+            message = message.replace("a valid tuple", "a list in brackets")
             found = "" if item["type"] == "value_error" else f"is {item['input']!r}; expected: "
             lines.append(f"{where}: {found}{message}")
     return lines
@@ -421,7 +461,9 @@ def resolve_files(patterns: list[str], root: Path, where: str) -> tuple[list[Pat
     for pattern in patterns:
         found = sorted(root.glob(pattern)) if any(c in pattern for c in "*?[") else [root / pattern]
         found = [file for file in found if file.is_file()]
-        if not found:
+        if not found and pattern.startswith("TODO"):  # as insitu init writes it
+            problems.append(f"{where}: still to be filled in: {pattern.removeprefix('TODO').lstrip(': ')}")
+        elif not found:
             problems.append(f"{where}: is {pattern!r}; no such file in {root}")
         files.update(found)
     return sorted(files), problems

@@ -108,9 +108,15 @@ class Build:
         return found["errors"] if current and found.get("composite") == current else {}
 
     def keep_waterfall(self, errors: dict[str, dict[str, float]]) -> None:
-        """Write what `waterfall` reads."""
+        """Write what `waterfall` reads: these rows, and former ones of the same composite and the same truth.
+
+        The truth is the same where the error with nothing in place is. Terms forced off stand last.
+        """
+        former = self.waterfall()
+        known = {**former, **errors} if former.get("nothing") == errors["nothing"] else errors
+        rows = dict(sorted(known.items(), key=lambda row: row[0].startswith("without ")))
         current = (self.record("composite") or {"outputs": {}})["outputs"].get("composite")
-        text = json.dumps({"composite": current, "errors": errors}, indent=1)
+        text = json.dumps({"composite": current, "errors": rows}, indent=1)
         formats.write_bytes(self.out / "waterfall.json", text.encode() + b"\n")
 
     @contextlib.contextmanager

@@ -15,6 +15,6 @@ Metal = Literal["aluminium", "brass", "chromium", "copper", "gold", "iron", "sil
 
 
 class Strict(BaseModel):
-    """Immutable, unknown keys refused."""
+    """Immutable; unknown keys, and numbers that are not finite, refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -25,6 +25,7 @@ from pipeline.conventions import (
 from pipeline.image.metrics import box, scale_of
 from pipeline.image.truth import Truth, load_truth, other_scene
 from pipeline.light import near_field
+from pipeline.light.alike import ALIKE
 from pipeline.light.sampling import bilinear, planes
 from pipeline.run.errors import ManifestError
 from pipeline.run.runner import Build, settle
@@ -71,9 +72,10 @@ def true_environment(values: Values, truth: Truth) -> Raster:
 
 
 def _lit(light: np.ndarray, values: Values, truth: Truth) -> Raster:
-    """A true map (H, W, 3) in the plate's unit, with the header of the build's."""
+    """A true map (H, W, 3) in the plate's unit, with the header of the build's, less the picture: no lens blurs it."""
     scale = scale_of(box(values["photographs"]["plate"].rgb()), box(truth.plate))
-    return Raster(Raster.split((light * scale).astype(np.float32)), ACESCG, values["environment"].attributes)
+    header = {name: text for name, text in values["environment"].attributes.items() if name != ALIKE}
+    return Raster(Raster.split((light * scale).astype(np.float32)), ACESCG, header)
 
 
 def true_places(values: Values, truth: Truth, build: Build, names: list[str]) -> Raster:

@@ -64,15 +64,23 @@ def shrunk(raster: Raster, factor: int) -> Raster:
     return Raster(channels, raster.space, raster.attributes)
 
 
-def coarser(environment: Raster) -> Raster:
-    """The map at half its width, each texel repeated, so that emitters keep their texels; an odd edge is continued."""
+def coarser(environment: Raster, emitters: list[Emitter]) -> Raster:
+    """The sky at half the map's width, each texel repeated; an odd edge is continued. Lamps stay as they are drawn."""
     rows, columns = environment.shape
-    half = shrunk(environment, 2).channels
+    lamps = np.concatenate([np.zeros(0, int), *(np.asarray(one.texels, int) for one in emitters)])
+    sky = {name: np.array(values) for name, values in environment.channels.items()}
+    for values in sky.values():
+        for one in emitters:
+            texels = np.asarray(one.texels, int)
+            values.ravel()[texels] = values.ravel()[texels].min(initial=np.inf)
+    half = shrunk(Raster(sky, environment.space), 2).channels
     whole = {name: values.repeat(2, 0).repeat(2, 1) for name, values in half.items()}
     channels = {
         name: np.pad(values, ((0, rows - values.shape[0]), (0, columns - values.shape[1])), "edge")
         for name, values in whole.items()
     }
+    for name, values in channels.items():
+        values.ravel()[lamps] = environment[name].ravel()[lamps]
     return Raster(channels, environment.space, environment.attributes)
 
 
@@ -254,7 +262,9 @@ class Pilot:
     def _under_coarse_map(self) -> Raster:
         """Layers of `MAP_SAMPLES` under the map at half its width. Compiled already: its CPU is that render's price."""
         cpu = time.process_time()
-        layers, _ = self._render(MAP_SAMPLES, {"environment": coarser(self.inputs["environment"])})
+        layers, _ = self._render(
+            MAP_SAMPLES, {"environment": coarser(self.inputs["environment"], self.inputs["emitters"])}
+        )
         self.warm_seconds = time.process_time() - cpu
         return layers
 

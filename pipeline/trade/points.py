@@ -23,6 +23,7 @@ LADDERS: dict[str, tuple[Any, ...]] = {
     "probe.supersample": (1, 3, 4),
     "lights.min_share": (1.0, 0.1, 0.02, 0.005),  # 1: no light is told from the sky
     "lights.max_half_angle_deg": (5.0, 10.0, 20.0),
+    "lights.width": ("seen", "unblurred"),
     "plane.left_out": (0.02, 0.008, 0.004, 0.001),
     "plane.find_proxies": ("never", "evidence"),
     "reflectance.model": ("uniform", "textured"),
