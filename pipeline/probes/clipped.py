@@ -79,7 +79,7 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     asked, refused = _asked(found)
     verdicts = dict(refused)
     rest = setting(rgb, np.where(held_by(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
-    answers, numbers = _answers(seen, rest, [light for _, light in asked])
+    answers, numbers = _sharpened(seen, rest, [light for _, light in asked])
     if vague := _vague(found, refused, rest):
         answers = [replace(answer, refused=answer.refused or vague) for answer in answers]
     out, spread, recovered = np.array(rgb, float), np.array(variance, float), np.zeros(clipped.shape)
@@ -147,6 +147,25 @@ def _vague(found: list[Light], refused: dict[int, str], rest: Setting) -> str:
     return ""
 
 
+def _sharpened(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Answer], dict[str, Any]]:
+    """The answers, once more with lamps where and as wide as their shadows' edges say, if an edge does.
+
+    Glare about a clipped lamp puts its middle off by up to a degree, and widens it, which hides much of its shadow.
+    """
+    first, numbers = _answers(seen, rest, asked)
+    sharp = [
+        replace(light, direction=answer.edge.direction, half_angle=answer.edge.half_angle)
+        if answer.edge and believed(light, answer.edge) else light
+        for light, answer in zip(asked, first, strict=True)
+    ]  # fmt: skip
+    if all(light is other for light, other in zip(asked, sharp, strict=True)):
+        return first, numbers
+    second, more = _answers(seen, rest, sharp)
+    if any(answer.refused and not before.refused for answer, before in zip(second, first, strict=True)):
+        return first, numbers
+    return [replace(a, edge=a.edge or before.edge) for a, before in zip(second, first, strict=True)], more
+
+
 def _answers(seen: Witness, rest: Setting, asked: list[Light]) -> tuple[list[Answer], dict[str, Any]]:
     """One answer for each lamp, and figures of the solution."""
     said: dict[str, Any] = {"flux_references": seen.cards.said} if seen.cards.said else {}
@@ -205,6 +224,8 @@ def _row(light: Light, answer: Answer | None, why: str, rest: Setting) -> dict[s
         "lower_bound": not told, "bound": light.bound.tolist(), "flux": flux.tolist(),
         "flux_sigma": answer.sigma.tolist() if told and answer else None,
         "edge_half_angle_deg": float(np.degrees(answer.edge.half_angle)) if answer and answer.edge else None,
+        "edge_half_angle_sigma_deg": float(np.degrees(answer.edge.sigma)) if answer and answer.edge else None,
+        "edge_blur_px": answer.edge.blur_px if answer and answer.edge else None,
         "condition": answer.condition if told and answer else None, "why_not": why, "share": share,
         "matters": share > MATTERS,
     }  # fmt: skip
@@ -245,12 +266,17 @@ def clipped_share(share: np.ndarray, maps: list[ViewMap]) -> np.ndarray:
     return np.asarray((share * parts).sum(0))
 
 
+def believed(light: Light, edge: Edge) -> bool:
+    """Whether the edge of its shadow says by twice its sigma that a lamp is narrower than its clipped picture."""
+    return edge.half_angle + 2 * edge.sigma <= NARROWER * light.half_angle
+
+
 def narrowed(out: np.ndarray, spread: np.ndarray, light: Light, edge: Edge | None) -> Light:
     """The lamp as the disc that its shadow's edge gives, if sharper than its picture, which becomes its surroundings.
 
-    The edge must say so by twice its sigma, and the disc must lie where the lamp was clipped.
+    The disc must lie where the lamp was clipped.
     """
-    if edge is None or edge.half_angle + 2 * edge.sigma > NARROWER * light.half_angle:
+    if edge is None or not believed(light, edge):
         return light
     texels, share = disc_texels(edge.direction, max(edge.half_angle, SUN_HALF_ANGLE), len(out))
     if not np.isin(texels, light.texels).all():

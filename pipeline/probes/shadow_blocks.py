@@ -17,12 +17,18 @@ MODEL = 0.002  # of the free irradiance: what the model of a shadow leaves out (
 
 @dataclass(frozen=True)
 class Blocks:
-    """Means of square blocks of pixels: points (N, 3) on the plane, ratio and sigma (N, 3), size (N,) [m]."""
+    """Means of square blocks of ``side`` x ``side`` pixels: points (N, 3) on the plane, ratio and sigma (N, 3).
+
+    ``size`` (N,): half diagonal [m]; ``step`` (N, 2, 3): how far on the plane a pixel along the row, and one along the
+    column, goes [m].
+    """
 
     points: np.ndarray
     ratio: np.ndarray
     sigma: np.ndarray
     size: np.ndarray
+    step: np.ndarray
+    side: int
 
 
 def plane_blocks(
@@ -45,6 +51,7 @@ def plane_blocks(
     corners = [
         _on_plane(camera, world_from_camera, px + np.array(step) * side / 2) for step in ((0, 0), (1, 1), (1, -1))
     ]
+    step = np.stack([corners[1] + corners[2] - 2 * corners[0], corners[1] - corners[2]], 1) / side
     size = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], 0)
     rays = pixel_rays(camera, px)
     outline = np.arcsin(ball.radius_m / np.linalg.norm(ball.centre_camera_m)) + (OUTLINE_PX + side) / camera.fx
@@ -55,7 +62,7 @@ def plane_blocks(
         ratio = (one / other).reshape(-1, 3)
         sigma = ratio * np.sqrt(one_variance / one**2 + other_variance / other**2).reshape(-1, 3)
     good &= np.isfinite(ratio).all(-1) & np.isfinite(sigma).all(-1) & (other.reshape(-1, 3) > 0).all(-1)
-    return Blocks(corners[0][good], ratio[good], np.hypot(sigma[good], MODEL), size[good])
+    return Blocks(corners[0][good], ratio[good], np.hypot(sigma[good], MODEL), size[good], step[good], side)
 
 
 def _window(

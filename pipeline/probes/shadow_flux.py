@@ -17,7 +17,7 @@ from pipeline.light.environment import irradiance, resize_environment
 from pipeline.light.flux import Card, Fluxes, Shadow, predicted, solve
 from pipeline.probes.cards import Cards
 from pipeline.probes.clipped_lights import Light, light_of, without
-from pipeline.probes.shadow_edge import Edge, fit_edge
+from pipeline.probes.shadow_edge import Edge, Penumbra, fit_edge
 from pipeline.probes.witness import Witness
 
 WIDEST = np.radians(10.0)  # half angle; the shadow of a wider one is as soft as the sky's
@@ -228,7 +228,5 @@ def edge_of(seen: Witness, rest: Setting, asked: list[Light], k: int, flux: np.n
     dark = predicted(reach, both)[0] - reach.visible[:, k, None] * step
     values = [part.mean(-1) for part in (blocks.ratio[index], dark, dark + step)]
     sigma = np.sqrt((blocks.sigma[index] ** 2).sum(-1)) / 3
-    return fit_edge(
-        blocks.points[index], blocks.size[index], values[0], sigma, values[1], values[2], asked[k].direction,
-        asked[k].half_angle, seen.ball,
-    )  # fmt: skip
+    edge = Penumbra(blocks.points[index], blocks.step[index], blocks.side, values[0], sigma, values[1], values[2])
+    return fit_edge(edge, asked[k].direction, asked[k].half_angle, seen.ball)

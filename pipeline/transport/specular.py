@@ -388,9 +388,10 @@ def explain(surface: Surface, gloss: str = "auto") -> dict[str, Any]:
     forced = "" if gloss == "auto" else f"knob reflectance.gloss = {gloss}; "
     scores = "; ".join(
         f"{row['model']} {row['gain']:+.1f} nats ({row['sigmas']:.1f} sigma) over {row['against']}"
+        if np.isfinite(row["gain"]) else f"{row['model']} cannot have made the held-out cells"
         for row in surface.scores
         if "gain" in row
-    )
+    )  # fmt: skip
     modelled = surface.model != "diffuse"
     asked: dict[str, Any] = next((row for row in surface.scores if "taken_for_matt" in row), {})
     wrong = asked.get("taken_for_matt")
