@@ -174,6 +174,15 @@ def brighter(raster: Raster, factor: float) -> Raster:
     return replace(raster, channels=channels)
 
 
+def test_lamps_are_as_wide_as_they_are(desk_build):
+    """7, 4 and 4 degrees, seen a quarter to two thirds wider: within 2 of the stated sigmas, which one lens shares."""
+    lamps = value(desk_build, A.EMITTERS)
+    seen = json.loads((desk_build / "lights/record.json").read_text())["numbers"]
+    for lamp, true in zip(lamps, (3.5, 2.0, 2.0), strict=True):
+        assert abs(np.degrees(lamp.half_angle_rad) - true) < 2 * np.degrees(lamp.half_angle_sigma_rad)
+        assert seen[lamp.name]["seen_half_angle_deg"] > 1.2 * true
+
+
 def test_twice_the_light_gives_twice_the_composite(desk_build):
     """Photographs and environment doubled.
 
@@ -181,7 +190,7 @@ def test_twice_the_light_gives_twice_the_composite(desk_build):
     up to rounding: 1e-4 of the pixel, and of the picture's median where it is black.
     """
     photographs = {name: brighter(raster, 2) for name, raster in value(desk_build, A.PHOTOGRAPHS).items()}
-    light = brighter(value(desk_build, A.ENVIRONMENT), 2)
+    light = brighter(value(desk_build, A.LIGHTING), 2)
     layers = rendered(desk_build, environment=light, photographs=photographs)
     once = value(desk_build, A.COMPOSITE).rgb()
     twice = composed(desk_build, photographs=photographs, layers=layers, environment=light).rgb()

@@ -433,7 +433,7 @@ def test_stage_whose_inputs_are_missing(capsys, tmp_path):
 def test_damaged_build_files(desk_build, capsys, tmp_path):
     out = copied(desk_build, tmp_path / "out")
     shutil.copy(desk_build / "settings.json", out)
-    for name, stage in (("probe/environment.exr", "reflectance"), ("calibrate/camera.json", "plane")):
+    for name, stage in (("lights/lighting.exr", "reflectance"), ("calibrate/camera.json", "plane")):
         size = (out / name).stat().st_size
         (out / name).unlink()  # a link: the original stays
         (out / name).write_bytes(b"{" * min(size, 1000))
@@ -442,7 +442,7 @@ def test_damaged_build_files(desk_build, capsys, tmp_path):
         assert name in line
     assert main(["verify", str(DESK), "--out", str(out)]) == 4
     text = capsys.readouterr().out
-    assert "environment.exr: differs from what probe wrote" in text
+    assert "lighting.exr: differs from what lights wrote" in text
     assert "camera.json: differs from what calibrate wrote" in text
 
 

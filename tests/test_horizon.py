@@ -50,7 +50,7 @@ def made(tmp_path_factory) -> dict[str, Any]:
     values: dict[str, Any] = {
         "facts": {"board": None, "marker": [{"side_m": 0.1}]}, "camera": CAMERA, "views": {"plate": view},
         "wishes": {"object": [wish(tmp_path_factory.mktemp("ball"), 0.0, base_color=[0.5, 0.5, 0.5])]},
-        "cloud": Reconstruction(), "environment": Raster(Raster.split(sky()), "acescg"), "emitters": [],
+        "cloud": Reconstruction(), "lighting": Raster(Raster.split(sky()), "acescg"), "emitters": [],
         "proxies": [], "occluders": [], "photographs": {"plate": plate}, "above": above,
     }  # fmt: skip
 

@@ -303,7 +303,7 @@ def test_a_hand_turns_frames_of_the_ball(monkeypatch) -> None:
     name = scene.ball_view[0].name
     assert list(made)[:2] == [name, f"{name}_1"]
     assert np.degrees(made[f"{name}_1"].mean()) == pytest.approx(0.2, abs=1e-6)
-    assert made[name].max() == 0
+    assert abs(made[name].max()) < 1e-15  # an angle between equal axes: rounding of their product
     assert len(set(seeds)) == len(made)
     shot: dict[str, float] = {}
     monkeypatch.setattr(capture.Shoot, "metered", lambda self, pictures, fill: 0)
