@@ -69,6 +69,11 @@ def extremes(records: Records) -> float:
     return sum(row["ok"] for row in rows) / len(rows)
 
 
+def bounded(kind: str) -> Value:
+    """Least share, over kinds of places, of errors within 1.96 sigma and the bound that is named as not covered."""
+    return lambda records: float(min(records["budget"]["kinds"][kind]["bounded"].values()))
+
+
 def intervals(kind: str) -> Value:
     """How many of the twelve intervals (four kinds of places, three shares) hold the truth as often as they state."""
 
@@ -138,6 +143,8 @@ PROMISES = [
                 "`make bench-budget`", least=True)
         for kind in ("desk", "courtyard", "corner")
     ),
+    Promise("uncertainty", "errors within 1.96 sigma and the bound that is named, 100 captures of corner",
+            0.95, bounded("corner"), "`make bench-budget`", least=True),
     Promise("extremes", "cases seen as they were defined", 1.0, extremes, "`make extremes`", least=True),
 ]  # fmt: skip
 
