@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks" / "ask.md"
 QUESTIONS = ("--max-error 0.01", "--max-error 0.02", "--max-error 0.05", "--max-error 0.1", "--time-budget 60")
 ALLOWED, TIME = 1.5, 0.25  # the project's: reached over asked, and how far CPU seconds may be from those predicted
+LONGER = 1.25  # times the least time that can be kept, where it is above the one that is asked
 INTRODUCTION = """# An error or a time, asked of the desk
 
 `make bench-ask` runs `insitu run sample_captures/desk` with each question, one after the other in one build folder, so
@@ -103,6 +104,9 @@ def main() -> None:
             final = final_error(args.capture, args.out)
             runs.append({"asked": asked, "refused": float(predicted[1]), "final": final})
             continue
+        if least := re.search(r"ask (\d+) or more", done.stderr):  # a slow machine: the pilot alone took that long
+            words[-1] = str(round(LONGER * int(least[1])))
+            done = subprocess.run(words, cwd=ROOT, stderr=subprocess.PIPE, text=True)
         if done.returncode:
             sys.exit(done.stderr)
         runs.append(json.loads((args.out / "run.json").read_bytes()))
