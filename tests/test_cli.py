@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import re
-import resource
 import shutil
 import struct
 import subprocess
@@ -15,30 +14,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import DESK, FOCAL, GIVEN, HEIGHT, POSE, ROOT, WIDTH, command, copied, desk_with, dng, refused, tiny
+from command import (
+    DESK,
+    FOCAL,
+    GIVEN,
+    HEIGHT,
+    POSE,
+    ROOT,
+    WIDTH,
+    command,
+    copied,
+    cpu_seconds,
+    desk_with,
+    dng,
+    quick_limit,
+    refused,
+    tiny,
+)
 
 from pipeline.run.board_facts import DICTIONARIES
 from pipeline.run.cli import main, share_cores
 from stages.order import NAMES
 
-QUICK_CPU_S = 0.3  # mission: --help, --version and refused manifests
 OBJECT = '[[object]]\nname = "cube"\nfile = "cube.obj"\nposition_m = [{x}, {z}]\n'
 CUBE = "v 0 0 0\nv 0.02 0 0\nv 0 0.02 0\nv 0 0 0.02\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
-
-
-def cpu_seconds(arguments: list[str]) -> float:
-    """User and system time of the command: the first of ten below the limit, else the least.
-
-    Beside other work a process needs half as much again, its caches being shared: what it can do is the least, and what
-    it does is told by the modules that it imports.
-    """
-    spent = []
-    while len(spent) < 10 and min(spent, default=QUICK_CPU_S) >= QUICK_CPU_S:
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        command(*arguments)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    return min(spent)
 
 
 @pytest.fixture
@@ -64,7 +63,8 @@ QUICK = (  # and how many modules: 119 and 250 are measured, a data class or an 
 @pytest.mark.parametrize(("arguments", "modules"), QUICK, ids=["help", "version", "manifest", "set"])
 def test_quick_answers_are_quick_and_leave_numpy_alone(arguments, modules, wrong):
     arguments = [word.format(wrong=wrong) for word in arguments]
-    assert cpu_seconds(arguments) < QUICK_CPU_S
+    limit = quick_limit()
+    assert cpu_seconds(arguments, limit) < limit
     words = [sys.executable, "-X", "importtime", "-m", "stages", *arguments]
     log = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False).stderr
     assert "pipeline.run.cli" in log
