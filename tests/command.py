@@ -140,7 +140,7 @@ def spent_by(words: list[str]) -> float:
 
 
 def quick_limit() -> float:
-    """The limit, or on a slow machine as much longer: five imports of what reads manifests, which take 0.06 s else."""
+    """The limit, or five imports of what reads manifests if longer: a refusal took 3.2 of them on a slow machine."""
     return max(
         QUICK_CPU_S, 5 * min(spent_by([sys.executable, "-c", "import argparse, pydantic.main"]) for _ in "12345")
     )
