@@ -92,7 +92,12 @@ def smaller(values: np.ndarray, factor: int, soft_px: float) -> np.ndarray:
     """(H / factor, W / factor, ...) means over factor x factor pixels, a little softened."""
     height, width = (size // factor for size in values.shape[:2])
     small = values.reshape(height, factor, width, factor, -1).mean((1, 3)).reshape(height, width, *values.shape[2:])
-    return np.asarray(blur(np.asarray(small, float), soft_px))
+    return softened(np.asarray(small, float), soft_px)
+
+
+def softened(picture: np.ndarray, by_px: float) -> np.ndarray:
+    """A picture (H, W, ...) blurred by ``by_px`` more: the simulator's lens counts a pixel's box in, which it has."""
+    return np.asarray(blur(picture, float(np.hypot(by_px, np.sqrt(1 / 12)))))
 
 
 def reduce_truth(bundled: Path, folder: Path, shape: tuple[int, int], factor: int, own_px: float) -> np.ndarray:
@@ -240,8 +245,6 @@ def write_poses(scene: SimulatedScene, manifest: Path, turned: dict[str, np.ndar
 
 def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: Path, out: Path) -> None:
     """Write capture ``number`` into ``out``; objects are a link to those in ``shared``."""
-    from scipy.ndimage import gaussian_filter
-
     scene = scene.model_copy(update={"seed": scene.seed + 1000 * (number + 1)})
     out.mkdir(parents=True)
     (out / "objects").symlink_to((shared / "objects").resolve())
@@ -249,10 +252,7 @@ def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: P
     shoot = Reshoot(scene, out, capture.sensor_of(scene))
     capture.write_manifests(scene, out)
     write_poses(scene, out / "capture.toml", turned)
-    balls = {
-        name: gaussian_filter(ball, (soft[name], soft[name], 0), mode="nearest")
-        for name, ball in pictures.balls.items()
-    }
+    balls = {name: softened(ball, soft[name]) for name, ball in pictures.balls.items()}
     shots = {**balls, "plate": pictures.plate}
     capture.take_brackets(shoot, {name: seen_turned(lens, shot, turned[name]) for name, shot in shots.items()})
     for board, picture in enumerate(pictures.boards):

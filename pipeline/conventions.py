@@ -27,6 +27,7 @@ WORLD_FROM_BOARD = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0
 WORLD_FROM_MARKER = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
 
 # Mask bits of a merged or developed photograph. A pixel may carry several.
+BOX_PX2 = 1 / 12  # variance along an axis of a pixel's own box
 CLIPPED = 1  # clipped in every frame: the value is a lower bound, its variance infinite
 DARK = 2  # below the noise in every frame
 GHOST = 4  # frames disagree beyond the noise model

@@ -159,6 +159,10 @@ class View(Record):
     lens_covariance: Array | None = None  # (6, L) of the pose with the camera's L numbers; None when given
     camera: Camera | None = None  # its own body, lens or size; None: the plate's
     motion: Motion | None = None  # what was undone; of a plate that was registered to a tripod view
+    # Standard deviation [px] of the Gaussian that lens and pixel box make together (the box counts as variance 1/12),
+    # measured on the edges of the print that the view shows, demosaicking taken off; None: too few of them show.
+    softness_px: float | None = None
+    softness_sigma_px: float = 0.0  # standard uncertainty at one place of the print, what varies over it included
 
 
 class Sources(Record):
@@ -258,7 +262,8 @@ class Emitter(Record):
     """A compact light: an exact set of texels of the lighting. What no emitter holds is the sky."""
 
     name: str  # "sun", "lamp_1", ... by falling irradiance
-    direction: Array  # (3,), unit, world frame: towards the light, mean weighted by irradiance
+    direction: Array  # (3,), unit, world frame: towards the light, mean weighted by irradiance or as its shadow says
+    direction_sigma_rad: Array = np.zeros(2)  # (2,) level and upright, of a lamp that its shadow's edge places; else 0
     solid_angle_sr: float  # of its texels
     half_angle_rad: float  # of the uniform disc of the same spread
     half_angle_sigma_rad: float = 0.0  # how much wider it may be, one standard uncertainty

@@ -25,7 +25,7 @@ import numpy as np
 from pipeline.conventions import ACESCG, CAMERA_RGB, CHART_VIEW, CLIPPED, FLAT_VIEW
 from pipeline.image import colour, sensitivities
 from pipeline.image.charted import read_chart, with_chart
-from pipeline.image.demosaic import Method, balance_gains, balanced_rgb, interpolation_variance
+from pipeline.image.demosaic import METHOD, Method, balance_gains, balanced_rgb, interpolation_variance
 from pipeline.image.vignetting import Losses
 from pipeline.run.artifacts import FACTS, MOSAICS, PHOTOGRAPHS
 from pipeline.run.errors import ArtifactError
@@ -215,7 +215,8 @@ def develop(mosaic: Raster, profile: dict[str, Any], method: Method, where: str)
     variance[unknown] = 0
     spread = colour.apply_matrix(matrix**2, variance)
     spread[unknown] = np.inf
-    return Raster({**Raster.split(rgb), **Raster.split(spread, "variance"), "mask": mask}, ACESCG)
+    told = {METHOD: method} if mosaic.attributes["insitu:cfa"] else {}
+    return Raster({**Raster.split(rgb), **Raster.split(spread, "variance"), "mask": mask}, ACESCG, told)
 
 
 def _numbers(photograph: Raster) -> dict[str, Any]:

@@ -145,6 +145,9 @@ class Render(Params):
     )
     threshold: float = Field(0.004, ge=0, le=0.05, description="change below this fraction is left to the plate")
     denoise: bool = Field(True, description="denoise the object layer and the relative change")
+    softness_px: float | None = Field(
+        None, ge=0, le=20, description="of the plate, lens and pixel as a Gaussian [px]; default: by the print it shows"
+    )
     light_groups: bool = Field(False, description="layers of every light alone: sky, sun, lamps")
     seed: int = Field(0, ge=0, description="seed of the sampler")
 

@@ -3,7 +3,8 @@
 A light is a connected set of the map's texels that stands out sharply, is narrow, and carries a share of the light that
 matters (`pipeline.light.emitters`). The light of a group is the map on its texels, so that lights and sky sum to the
 map exactly. A lamp that was measured is drawn as wide as it is, without what the probe's picture spread it
-(`pipeline.light.narrowing`): that moves its light by about a pixel of that picture, and adds and loses none. What was
+(`pipeline.light.narrowing`): that moves its light by about a pixel of that picture, and adds and loses none. One that
+was recovered is drawn as the disc that its shadow's edge gives, where it does (`pipeline.light.placed`). What was
 clipped and not recovered is said to be a lower bound. Limits: light is distant; windows and tubes that are wide stay in
 the sky, as blurred as the probe saw them, which the renderer samples by brightness.
 """
@@ -18,6 +19,7 @@ from pipeline.light.alike import flux_sigma
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.environment import total_energy
 from pipeline.light.narrowing import drawn, half_angle_of, spread_of
+from pipeline.light.placed import is_placed, nearest, placed_in
 from pipeline.run.artifacts import EMITTERS, ENVIRONMENT, LIGHTING
 from pipeline.run.evidence import TRIED
 from pipeline.run.stage import Stage
@@ -32,7 +34,7 @@ COSTS = {
     "clipped": "all that it is brighter than its clipped value",
 }
 STAYS = {  # why a lamp is as wide as the map has it
-    "recovered": "its shadow's edge tells how wide it is, where it is wide enough to tell",
+    "recovered": "its flux is known by cards, or its shadow's edge does not tell that it is narrower than its picture",
     "clipped": "clipped in its middle: its moments do not tell how wide it is",
 }
 RENDERED = {*"RGB", *(f"variance.{channel}" for channel in "RGB"), "seen"}
@@ -56,12 +58,15 @@ def compute(environment: Raster, params: knobs.Lights) -> Result:
         )
         for number, patch in enumerate(kept, 1)
     ]  # fmt: skip
+    if params.width == "unblurred":
+        emitters = [as_its_edge_says(environment, emitter) for emitter in emitters]
     spread = spread_of(environment)
     lit = drawn(lighting(environment), emitters, spread if params.width == "unblurred" else 0.0)
     numbers = {
         emitter.name: {
             "share": patch.share, "half_angle_deg": float(np.degrees(true.half_angle_rad)),
             "half_angle_sigma_deg": float(np.degrees(true.half_angle_sigma_rad)),
+            "direction_sigma_deg": np.degrees(true.direction_sigma_rad).tolist(),
             "seen_half_angle_deg": float(np.degrees(patch.half_angle_rad)), **angles(patch),
             "irradiance": patch.irradiance.tolist(), "texels": len(patch.texels),
             "irradiance_sigma": emitter.irradiance_sigma.tolist(), "lower_bound": emitter.lower_bound,
@@ -89,6 +94,18 @@ def source(environment: Raster, patch: Patch) -> str:
     if not over.any():
         return "measured"
     return "recovered" if environment["recovered"].ravel()[patch.texels][over].all() else "clipped"
+
+
+def as_its_edge_says(environment: Raster, emitter: Emitter) -> Emitter:
+    """A recovered lamp with direction and half angle of its shadow's edge, and their sigmas, if the map places it."""
+    lamp = nearest(placed_in(environment), emitter.direction) if emitter.evidence == "recovered" else None
+    if lamp is None:
+        return emitter
+    found = {
+        "direction": np.array(lamp.direction), "direction_sigma_rad": np.array(lamp.direction_sigma),
+        "half_angle_rad": lamp.half_angle, "half_angle_sigma_rad": lamp.half_angle_sigma,
+    }  # fmt: skip
+    return emitter.model_copy(update=found)
 
 
 def is_sun(rgb: np.ndarray, found: list[Patch]) -> bool:
@@ -152,8 +169,10 @@ def evidence(
 
 def widths(lamps: list[Emitter], found: list[Patch], spread_rad: float, width: str) -> list[dict[str, Any]]:
     """Why each lamp is as wide as it is drawn; nothing of a map that no picture spread (``spread_rad`` = 0)."""
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = [placement(lamp, patch) for lamp, patch in zip(lamps, found) if is_placed(lamp)]
     for lamp, patch in zip(lamps, found, strict=True) if spread_rad > 0 else ():
+        if is_placed(lamp):
+            continue
         moved = width == "unblurred" and lamp.evidence == "measured"
         true = lamp.half_angle_rad if moved else half_angle_of(patch.half_angle_rad, spread_rad)
         seen_as = np.hypot(true, 2 * spread_rad) if moved else patch.half_angle_rad
@@ -173,6 +192,18 @@ def widths(lamps: list[Emitter], found: list[Patch], spread_rad: float, width: s
             **({} if moved else {"bound_rel": (1 - ratio) / 2 * patch.share}),
         })  # fmt: skip
     return rows
+
+
+def placement(lamp: Emitter, patch: Patch) -> dict[str, Any]:
+    """Why a recovered lamp stands where it does, and is as wide as it is drawn."""
+    level, upright = np.degrees(lamp.direction_sigma_rad)
+    return {
+        "term": f"place and width of {lamp.name} by its shadow's edge", "modelled": True,
+        "because": f"half angle {np.degrees(lamp.half_angle_rad):.2f} +- {np.degrees(lamp.half_angle_sigma_rad):.2f} "
+        f"degrees, direction +- {level:.3f} level and +- {upright:.3f} upright; the map's texels have "
+        f"{np.degrees(patch.half_angle_rad):.2f}",
+        "could_cost": "its sigmas: modes of the budget", "bound_rel": 0.0,
+    }  # fmt: skip
 
 
 STAGE = Stage(

@@ -17,7 +17,7 @@ pictures say that the camera turned. Limits: a flat board of the stated size; a 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,13 @@ from pipeline.camera.map_report import report
 from pipeline.camera.marker_map import with_tripod
 from pipeline.camera.markers import grey
 from pipeline.camera.opencv_bridge import Sightings
-from pipeline.camera.pose_report import figures, reasons
+from pipeline.camera.pose_report import figures, reasons, softness_reason
 from pipeline.camera.resection import resect_plane
 from pipeline.camera.sfm import Seen
 from pipeline.camera.sights import FEWEST_CORNERS, marks_in
+from pipeline.camera.softness import of_lens, softness
 from pipeline.camera.tripod_registration import lender, registered, turned
+from pipeline.image.demosaic import METHOD
 from pipeline.probes.standing import standing_chi2
 from pipeline.run.artifacts import (
     CAMERA,
@@ -139,8 +141,18 @@ def compute(
         numbers[name]["registration"] = turn
     numbers["plate"] |= bare
     numbers |= {key: part for key, part in (("sfm", extra), ("marker_map", places)) if part}
+    soft = {n: softness(photographs[n], cameras[n], views[n].world_from_camera, facts) for n in orders}
     result = {name: views[name].model_copy(update={"camera": view_cameras.get(name)}) for name in orders}
-    return Result({"views": result, "cloud": cloud}, numbers, warnings, reasons(orders, views, list(cameras.values())))
+    for name, edges in soft.items():
+        if edges is not None:
+            lens = of_lens(edges, photographs[name].attributes.get(METHOD))
+            numbers[name]["softness"] = asdict(edges) | {"lens_px": lens.px, "lens_sigma_px": lens.sigma_px}
+            update = {"softness_px": lens.px, "softness_sigma_px": lens.sigma_px}
+            result[name] = result[name].model_copy(update=update)
+    why = reasons(orders, views, list(cameras.values()))
+    method = photographs["plate"].attributes.get(METHOD)
+    why.append(softness_reason(soft["plate"], method, [name for name in tripod if soft[name]]))
+    return Result({"views": result, "cloud": cloud}, numbers, warnings, why)
 
 
 def bare_plate(shows: str, view: View, photographs: dict[str, Raster], camera: Camera) -> tuple[View, dict[str, Any]]:

@@ -17,9 +17,10 @@ from pipeline.camera.view_checks import check_feet, feet_of, height_above
 from pipeline.conventions import ACESCG, RADIANCE_UNIT, latlong_solid_angles
 from pipeline.image.balance import balanced, shared_sigma
 from pipeline.light import near_field, resolution, smooth
-from pipeline.light.alike import ALIKE, ALIKE_VIEWS, RAISED
+from pipeline.light.alike import RAISED
 from pipeline.light.environment import AXES, AXIS_NAMES, SCALE_SIGMA, irradiance
 from pipeline.light.harmonics import COSINE_LOBE, sh9_irradiance, sh9_of_environment, sh9_sigma
+from pipeline.light.placed import header_of
 from pipeline.probes import clipped, combine, filling, ground_gloss, levelling
 from pipeline.probes.kinds import KINDS
 from pipeline.probes.observation import Grid, Shots, ViewMap, lookup_channels
@@ -46,7 +47,7 @@ def compute(
     maps, warnings = dict(observed.maps), list(observed.warnings)
     numbers = dict(observed.numbers)
     numbers["views"], applied = level_views(maps, warnings)
-    merged, alike = combine.merge(list(maps.values())), combine.alike_deg(list(maps.values()))
+    merged = combine.merge(list(maps.values()))
     shared = np.hypot(observed.scale_sigma, shared_sigma(balance, next(iter(maps))))  # by all: merging keeps it
     plate, eye = lookup_channels(photographs["plate"])[..., :7], views["plate"].world_from_camera
     below = combine.plate_below(plate, camera, eye, observed.centre_world, merged.seen.shape)
@@ -92,8 +93,9 @@ def compute(
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
         | {SCALE_SIGMA: " ".join(f"{sigma:.6g}" for sigma in np.broadcast_to(shared, 3))}
-        | ({} if alike is None else {ALIKE: f"{alike:.4g}", ALIKE_VIEWS: combine.equal_views(merged)})
-        | near_field.places(centre if near.target is None else near.target, centre),
+        | combine.picture_header(merged, maps, views)
+        | near_field.places(centre if near.target is None else near.target, centre)
+        | ({} if near.target is not None or observed.smooth_only else header_of(lamps.placed)),
     )
     coefficients = sh9_of_environment(rgb)
     sigma = np.hypot(sh9_sigma(variance), np.abs(coefficients) * shared)

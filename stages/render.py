@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from pipeline.transport.placing import clearances, feet, off_plane, place_object
 from pipeline.transport.reflectance import reflected_radiance
 from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
+from pipeline.transport.softened import SOFTNESS, Softness, softened, softness_of
 from pipeline.transport.trace import LensRays, Rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
@@ -107,6 +108,8 @@ def compute(
     apart = strong(emitters, plane, upward)
     worlds = build_worlds(plane, albedo.rgb(), environment.rgb(), shapes, local_proxies, apart, surface, occluders)
     canvas, left = prepare(worlds, rays, shape, upward, Grain(plate), white, limits, effort, film, tell)
+    soft = softness_of(views, params.softness_px)
+    canvas = replace(canvas, softness=soft)
     if not (canvas.region.weight > 0).any() or not len(canvas.traced):
         raise ManifestError("scene.toml: no object and no shadow falls into the frame; check position_m and scale")
     numbers: dict[str, Any] = left | {
@@ -130,7 +133,9 @@ def compute(
         result = refined(canvas)
     layers, found, said = result
     numbers |= found
-    return Result({"layers": layers}, numbers, unsteady + warnings + said, evidence(params, numbers) + lifted)
+    numbers["softness_px"], numbers["softness_sigma_px"] = soft.px, soft.sigma_px
+    rows = [*evidence(params, numbers), through_lens(soft), *lifted]
+    return Result({"layers": layers}, numbers, unsteady + warnings + said, rows)
 
 
 def strong(emitters: list[Emitter], plane: Plane, light: np.ndarray) -> list[Emitter]:
@@ -264,7 +269,10 @@ def empty_layers(shape: tuple[int, int]) -> Raster:
 
 
 def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
-    """Channels of the size of the plate of pictures of the canvas's window; the feather scales the change."""
+    """Channels of the size of the plate of pictures of the canvas's window, as soft as the plate.
+
+    The feather scales the change; where it ends the plate is left alone, whatever the lens would carry there.
+    """
     fade = canvas.region.weight[..., None]
     lost, gained = images["lost"] * fade, images["gained"] * fade
     layers = {
@@ -276,12 +284,16 @@ def to_layers(images: dict[str, np.ndarray], canvas: Canvas) -> Raster:
         "variance": images["change_variance"] * fade**2,
         "objvariance": images["obj_variance"],
     }
+    shown = canvas.region.weight > 0
+    by = canvas.softness.variance if canvas.softness else 0.0
+    layers = {name: softened(rgb, by) * shown[..., None] for name, rgb in layers.items()}
     channels = {name: values for layer, rgb in layers.items() for name, values in Raster.split(rgb, layer).items()}
-    channels |= {"obj.A": images["alpha"], "ground": images["ground"]}
+    channels |= {n: softened(images[m], by) * shown for n, m in (("obj.A", "alpha"), ("ground", "ground"))}
     channels |= {"noise.change": images["change_noise"] * canvas.region.weight, "noise.obj": images["obj_noise"]}
     channels["influence"] = canvas.region.weight
     framed = {name: canvas.framed(values) for name, values in channels.items()}
-    return Raster(framed, ACESCG, {"dataWindow": data_window(*canvas.window)})
+    told = {SOFTNESS: f"{canvas.softness.px:.7g} {canvas.softness.sigma_px:.7g}"} if canvas.softness else {}
+    return Raster(framed, ACESCG, {"dataWindow": data_window(*canvas.window), **told})
 
 
 def measure(canvas: Canvas, halves: Halves) -> dict[str, Any]:
@@ -367,6 +379,23 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
             "bound_rel": deeper,
         },
     ]
+
+
+def through_lens(soft: Softness) -> dict[str, Any]:
+    """Why what is rendered is as soft as it is."""
+    because = {
+        "stated": "knob render.softness_px",
+        "measured": "the edges of the print in the plate",
+        "measured elsewhere": "the edges of the print in another view of its camera",
+        "assumed": "no view shows a print; what lenses and demosaicking usually leave",
+    }[soft.source]
+    return {
+        "term": "the plate's lens on what is rendered",
+        "modelled": soft.variance > 0,
+        "because": f"{because}: {soft.px:.2f} +- {soft.sigma_px:.2f} px, pixel included",
+        "could_cost": "its sigma, at edges" if soft.variance > 0 else "edges sharper than the photograph's",
+        **({} if soft.variance > 0 else {"bound_rel": 0.0}),
+    }
 
 
 def deeper_light(depth: int) -> float:

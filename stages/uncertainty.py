@@ -2,10 +2,11 @@
 
 Independent per pixel: the plate's noise and what sampling and denoising left of the render. Shared: a few modes, each
 exported as the change of the composite per standard uncertainty (scale of the light, flux and width of lamps, the sky
-in lobes, turns of the map, pose and lens). Light enters linearly and is rendered once per pattern, few pixels, few
-samples (`pipeline.budget.response`); patterns too weak to matter are left out and said. ``sigma`` is relative to the
-plate's own scale: what plate and light share (the capture's one unit) is no error here. Limits: first order; what the
-objects reflect is taken as wished; what no stage states an uncertainty for is named in ``not_covered``, in its words.
+in lobes, turns of the map, pose and lens, softness of the plate). Light enters linearly and is rendered once per
+pattern, few pixels, few samples (`pipeline.budget.response`); patterns too weak to matter are left out and said.
+``sigma`` is relative to the plate's own scale: what plate and light share (the capture's one unit) is no error here.
+Limits: first order; what the objects reflect is taken as wished; what no stage states an uncertainty for is named in
+``not_covered``, in its words.
 """
 
 from __future__ import annotations
@@ -20,13 +21,16 @@ from pipeline.budget.response import DIMMER, STEP_RAD, Grid, Layers, Response, S
 from pipeline.conventions import ACESCG
 from pipeline.light.alike import shared_sigma_of
 from pipeline.light.environment import irradiance
+from pipeline.light.placed import is_placed, without_placed
 from pipeline.run import artifacts as A
 from pipeline.run.evidence import not_covered
 from pipeline.run.masks import masks_of
 from pipeline.run.stage import Stage
 from pipeline.transport import differential as d
 from pipeline.transport.placing import place_objects
+from pipeline.transport.region import Window
 from pipeline.transport.scene import Worlds, build_worlds, relit
+from pipeline.transport.softened import SOFTNESS, softer
 from pipeline.transport.trace import LensRays
 from pipeline.types import Balance, BallFit, Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
 from stages import knobs
@@ -78,6 +82,7 @@ def compute(
         followed, left = patterns(environment, emitters, balance, balls, views, params.share)
         modes = light_modes(studio, full, followed)
         modes += geometry_modes(studio, composite, plate, params.share)
+        modes += softness_modes(composite, plate, str(layers.attributes.get(SOFTNESS, "0 0")), window)
         numbers = {"step_px": grid.step, "traced_px": int(grid.chosen.sum()), "followed": [p.name for p in followed]}
         evidence = reasons(followed, left, params.share)
     picture = composite.rgb()
@@ -207,9 +212,9 @@ def patterns(
     tied = next((balance[name].covariance for name in [*balls, *balance] if name in balance), None)
     found = light.scale_patterns(light.scale_covariance(shared, tied))
     found += light.flux_patterns(environment, emitters, shared) + light.sky_patterns(environment, emitters, shared)
-    found += light.width_patterns(environment, emitters)
+    found += light.width_patterns(environment, emitters) + light.lamp_turns(environment, emitters)
     if balls:
-        found += light.turn_patterns(environment, light.direction_covariance(balls, views))
+        found += light.turn_patterns(environment, emitters, light.direction_covariance(balls, views))
     return light.worth_following(found, share)
 
 
@@ -238,7 +243,8 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             assert pattern.turn is not None
             angle = float(np.linalg.norm(pattern.turn))
             step = pattern.turn * STEP_RAD / angle
-            moved = light.turned(studio.rgb, step)
+            rest = without_placed(studio.rgb, studio.emitters)
+            moved = light.turned(rest, step) + studio.rgb - rest
             apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
             share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
             change = angle / STEP_RAD * response.of_turn(apart, share)
@@ -247,9 +253,12 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
 
 
 def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
-    """The emitters on the texels that a turned map has them on."""
+    """The emitters on the texels that a turned map has them on; placed ones stay."""
     moved = []
     for emitter in studio.emitters:
+        if is_placed(emitter):
+            moved.append(emitter)
+            continue
         alone = np.zeros((*studio.rgb.shape[:2], 1))
         alone.reshape(-1)[np.asarray(emitter.texels, int)] = 1.0
         covered = light.turned(alone, turn)[..., 0]
@@ -274,6 +283,16 @@ def geometry_modes(studio: Studio, composite: Raster, plate: Raster, share: floa
         change += ground * geometry.moved_by(shade, by_ground) + geometry.moved_by(add, by_ground)
         modes.append(pixels.Mode(f"pose_{number}", "pose", change.astype(np.float32)))
     return modes
+
+
+def softness_modes(composite: Raster, plate: Raster, stated: str, window: Window) -> list[pixels.Mode]:
+    """What a softer plate than the ``stated`` one (b and its sigma, px) would make of all that is drawn into it."""
+    px, sigma_px = (float(number) for number in stated.split())
+    variance = 2 * px * sigma_px
+    if variance <= 0:
+        return []
+    mul, add, obj = (softer(composite.rgb(layer)[window], variance) for layer in ("mul", "add", "obj"))
+    return [pixels.Mode("softness", "softness", (plate.rgb()[window] * mul + add + obj).astype(np.float32))]
 
 
 def reasons(followed: list[light.Pattern], left: list[light.Pattern], share: float) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import render
+from benchmarks import render, resimulate
 from benchmarks.cycles import layers
 from benchmarks.estimators import closed_form, load, naive, ours, sun_of
 from benchmarks.measures import Point, cost_at, display, exposure_gain, middle, speedup, squared_error
@@ -170,3 +170,14 @@ def test_a_part_that_was_measured_is_kept_for_the_same_settings(tmp_path, monkey
     assert render.measured("part", part, one, True)["rows"] == {"row": 1}
     assert render.measured("part", part, two, True)["rows"] == {"row": 2}
     assert render.measured("part", part, two, False)["rows"] == {"row": 3}
+
+
+@pytest.mark.parametrize("by_px", [0.1, 0.3, 0.6])
+def test_captures_taken_again_are_as_soft_as_stated(by_px) -> None:
+    """Variances add: a point that is made softer by a sigma has that variance along each axis, the sum kept."""
+    point = np.zeros((9, 9, 1))
+    point[4, 4] = 1
+    soft, place = resimulate.softened(point, by_px)[..., 0], np.arange(9) - 4
+    assert soft.sum() == pytest.approx(1)
+    assert (soft.sum(0) * place**2).sum() == pytest.approx(by_px**2)
+    assert (soft.sum(1) * place**2).sum() == pytest.approx(by_px**2)

@@ -359,7 +359,8 @@ def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
     assert alone.any()
     assert sigma[alone] == pytest.approx(np.sqrt(plate.rgb("variance")[alone]), rel=2e-3)
     covered = layers["obj.A"] > 0.999
-    assert not unsure.rgb("plate")[covered].any()  # nothing of the plate is left there
+    own = np.sqrt(plate.rgb("variance")[covered])
+    assert (unsure.rgb("plate")[covered] <= 1.01e-3 * own).all()  # no more of the plate is left there; 16 bit
     budget = json.loads((desk_build / "uncertainty" / "budget.json").read_text())
     assert "near field: the map at the objects" in {row["term"] for row in budget["not_covered"]}
     assert 0.001 < budget["regions"]["object"]["mean_rel"]["total"] < 0.02

@@ -14,6 +14,7 @@ from pipeline.conventions import CLIPPED, invert_rigid, latlong_directions, latl
 from pipeline.light import ball_shadow
 from pipeline.light.environment import irradiance
 from pipeline.light.flux import Card, Shadow, predicted, solve
+from pipeline.light.placed import axes_about, header_of
 from pipeline.probes import clipped, shadow_flux
 from pipeline.probes.cards import Cards
 from pipeline.probes.clipped_lights import find_lights
@@ -76,7 +77,7 @@ def case(scene, pictures, strengths, columns: slice = slice(None), unmapped: tup
     rgb, over = flux_scene.true_map(scene, mapped, CLIP)
     seen = Witness(
         ball_shadow.Ball(flux_scene.CENTRE, flux_scene.RADIUS, scene.reflectance), blocks,
-        shift=np.array([0, 0, 5e-5]), eye=scene.world_from_camera[:3, 3],
+        shift=np.array([0, 0, 5e-5]), place=np.eye(3) * 5e-5**2, eye=scene.world_from_camera[:3, 3],
     )  # fmt: skip
     return clipped.recover(rgb, (0.01 * rgb) ** 2, over, seen), fluxes, rgb, over
 
@@ -127,9 +128,12 @@ def test_the_shadows_edge_makes_it_a_sun(scene, pictures):
         **Raster.split(found.variance.astype(np.float32), "variance"),
     }
     channels |= {"clipped": found.clipped.astype(np.float32), "recovered": found.recovered.astype(np.float32)}
-    (emitter,) = room.compute(Raster(channels, "acescg"), knobs.Lights()).outputs["emitters"]
+    picture = Raster(channels, "acescg", header_of(found.placed))
+    (emitter,) = room.compute(picture, knobs.Lights()).outputs["emitters"]
     assert (emitter.name, emitter.evidence, emitter.lower_bound) == ("sun", "recovered", False)
-    assert np.degrees(np.arccos(emitter.direction @ scene.lamps[HIGH].direction)) < 0.7  # half a texel
+    off = axes_about(emitter.direction) @ (scene.lamps[HIGH].direction - emitter.direction)
+    assert np.all(np.abs(off) < 3 * emitter.direction_sigma_rad)
+    assert np.degrees(emitter.direction_sigma_rad).max() < 0.15  # of texels of 1.4
     np.testing.assert_allclose(emitter.irradiance, fluxes[HIGH], rtol=0.03)
 
 

@@ -39,6 +39,7 @@ BRIDGES = {
         "pipeline/run/formats.py",
         "pipeline/transport/denoise.py",  # its filters: 3 to 10 times quicker than those of scipy
         "pipeline/transport/region.py",  # likewise, and loaded in a tenth of the time
+        "pipeline/transport/softened.py",  # likewise
         "pipeline/simulation/surfaces.py",  # draws the board; shares no code with what reads it
     },
     "mitsuba": {"pipeline/transport/variant.py"},

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
 from pipeline.light import narrowing
-from pipeline.light.alike import ALIKE, ALIKE_PX
+from pipeline.light.alike import ADDED_PX2, ALIKE, ALIKE_PX, ALIKE_VIEWS, SOFT
 from pipeline.light.emitters import Sky
 from pipeline.light.environment import AXES, irradiance
 from pipeline.types import Raster
@@ -50,6 +50,13 @@ def of_picture(rgb: np.ndarray, spread: float) -> Raster:
     return Raster(channels, "acescg", {ALIKE: f"{degrees:.6g}"})
 
 
+def told_how_soft(picture: Raster, spread: float, soft_px: float, views: float) -> Raster:
+    """As from pictures whose lens and pixel are ``soft_px``, of such pixels that a point becomes ``spread`` [rad]."""
+    pixel = np.sqrt((spread**2 - TEXEL**2 / 6) / (soft_px**2 + ADDED_PX2))
+    header = {ALIKE: f"{np.degrees(pixel) * ALIKE_PX:.6g}", ALIKE_VIEWS: f"{views}", SOFT: f"{soft_px}"}
+    return Raster(picture.channels, "acescg", header)
+
+
 def half_axes_of(raster: Raster, lamp) -> np.ndarray:
     """Half axes [rad], ascending, of the uniform ellipse of the moments of what a lamp's texels show above the sky."""
     rows, columns = raster.shape
@@ -79,6 +86,18 @@ def test_a_lamp_has_its_true_width_and_all_its_light(where):
     (row,) = [row for row in result.evidence if "width" in row["term"]]
     assert row["modelled"]
     assert "half angle 3.4" in row["because"]
+
+
+@pytest.mark.parametrize("soft_px", [0.55, 0.85])
+def test_how_soft_the_picture_is_tells_the_width_and_makes_it_surer(soft_px):
+    """Pixels of 1.2 or 1.0 degrees, of which a lens makes 1.4: the same lamp of 2 degrees; to 4 % as above."""
+    picture = of_picture(shown((0.4, 0.8, 0.45), np.radians([2.0, 2.0]), SPREAD), SPREAD)
+    known = told_how_soft(picture, SPREAD, soft_px, views=2.0)
+    (lamp,) = room.compute(known, knobs.Lights()).outputs["emitters"]
+    assert np.degrees(lamp.half_angle_rad) == pytest.approx(2.0, rel=0.04)
+    assert narrowing.spread_sigma_of(known) == pytest.approx(narrowing.LAMP_SIGMA / np.sqrt(2))
+    (unsure,) = room.compute(picture, knobs.Lights()).outputs["emitters"]
+    assert lamp.half_angle_sigma_rad < 0.7 * unsure.half_angle_sigma_rad
 
 
 def test_a_long_lamp_stays_long():

@@ -4,7 +4,8 @@ The map's stated variance has four parts with different shapes. What all texels 
 and probe, reflectance of the ball). An emitter's *flux* is its own, as sure as it states. The rest of the sky is taken
 in six smooth *lobes*, the squares of the direction's components, which sum to 1: errors of texels are alike within a
 few pixels of the probe's picture (`pipeline.light.alike`). What no view saw moves as one, *unseen*. A wrong centre of
-the ball or a wrong pose of the camera turns the whole map: three *turns*. How much the probe's picture widened lamps,
+the ball or a wrong pose of the camera turns the whole map: three *turns*; not lamps that a shadow's edge places, which
+turn by their own two, level and upright. How much the probe's picture widened lamps,
 and so how soft their shadows are, is known to some percent: all lamps wider at once are one *width*. Which of them the
 composite can notice is bounded by the irradiance they carry to the plane and to the six sides of an object; those that
 together stay below a share of the variance are left out, and said.
@@ -20,10 +21,12 @@ from pipeline.camera.rigid import rotation_exp, skew
 from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
 from pipeline.light.alike import alike_rows, cell_sums, own_sigma
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment, total_energy
-from pipeline.light.narrowing import widened
+from pipeline.light.narrowing import measured, widened
+from pipeline.light.placed import draw_disc, is_placed, turned_to, without_placed
 from pipeline.types import BallFit, Emitter, Raster, View
 
 BOUND_MAP = (64, 128)  # of the maps whose irradiance bounds a pattern
+SKY_MAP = (256, 512)  # of the lobes: errors of texels are alike over several degrees
 UNSEEN = 0.25  # coverage below which a texel was filled in, as the probe stage has it
 
 
@@ -42,7 +45,7 @@ class Pattern:
     ``source``: scale, flux, sky, unseen, turn or width. Either ``factor`` (3,), relative, the same all round; or
     ``radiance`` (H, W, 3), what is added; or ``turn`` (3,), a rotation vector [rad] of the map in the world; or the map
     with other ``lamps``. ``bound``: largest change of irradiance, relative, on the plane and on the six sides of a box;
-    of a width, within penumbrae.
+    of a width, and of a lamp's own turn, within penumbrae.
     """
 
     name: str
@@ -93,17 +96,20 @@ def flux_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarr
 
 
 def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarray) -> list[Pattern]:
-    """The six lobes, and what nobody saw."""
-    rgb, sigma = environment.rgb().astype(float), own_sigma(environment, shared)
+    """The six lobes, and what nobody saw; emitters' texels are none of it. On `SKY_MAP` where the map is finer."""
+    level, sigma = np.maximum(environment.rgb().astype(float), 0), own_sigma(environment, shared)
+    before = sides(level)
     for emitter in emitters:
+        level.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0
         sigma.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0
-    height, width = environment.shape
-    directions, weight = latlong_directions(height, width), latlong_solid_angles(height, width)[..., None]
-    seen = environment.channels.get("seen", np.ones((height, width)))
+    seen = environment.channels.get("seen", np.ones(environment.shape))
     unseen = np.where((seen < UNSEEN)[..., None], sigma, 0)
-    sigma = sigma - unseen
-    rows = alike_rows(environment)
-    level = np.maximum(rgb, 0)
+    sigma, rows = sigma - unseen, alike_rows(environment)
+    if environment.shape[0] > SKY_MAP[0]:
+        level, sigma, unseen = (resize_environment(values, *SKY_MAP) for values in (level, sigma, unseen))
+        rows = max(1, round(rows * SKY_MAP[0] / environment.shape[0]))
+    height, width = level.shape[:2]
+    directions, weight = latlong_directions(height, width), latlong_solid_angles(height, width)[..., None]
     unsure, energy = weight * sigma, weight * level
     lobes, sizes, changes, direct = [], [], [], np.zeros(3)
     for axis in AXES:
@@ -118,7 +124,7 @@ def sky_patterns(environment: Raster, emitters: list[Emitter], shared: np.ndarra
     # Six numbers average what varies within a lobe: as much is given back as irradiance has of it.
     carried = np.square(changes).sum((0, 1))
     back = np.sqrt(np.divide(direct, carried, out=np.ones(3), where=carried > 0))
-    before, found = sides(level), []
+    found = []
     for name, lobe, size, change in zip(AXIS_NAMES, lobes, sizes, changes, strict=True):
         bound = relative_change(change * back, before)
         found.append(Pattern(f"sky_{name}", "sky", bound, radiance=lobe * level * (size * back)))
@@ -142,17 +148,18 @@ def direction_covariance(balls: dict[str, BallFit], views: dict[str, View]) -> n
     return total / max(len(balls), 1) ** 2
 
 
-def turn_patterns(environment: Raster, covariance: np.ndarray) -> list[Pattern]:
-    """Three independent turns of the map by its covariance (3, 3) rad^2."""
+def turn_patterns(environment: Raster, emitters: list[Emitter], covariance: np.ndarray) -> list[Pattern]:
+    """Three independent turns of the map by its covariance (3, 3) rad^2; placed lamps stay where they are."""
     values, vectors = np.linalg.eigh(covariance)
-    small = coarse(np.maximum(environment.rgb(), 0))
-    before = irradiance(small, AXES)
+    rgb = environment.rgb()
+    small = coarse(np.maximum(without_placed(rgb, emitters), 0))
+    before, level = irradiance(small, AXES), sides(np.maximum(rgb, 0))
     found = []
     for number, (value, vector) in enumerate(sorted(zip(values, vectors.T), key=lambda pair: -pair[0])):
         if value > 0:
             turn = np.sqrt(value) * vector
             after = irradiance(small, AXES @ rotation_exp(turn))  # the light that came to R^T n now comes to n
-            found.append(Pattern(f"turn_{number}", "turn", relative_change(after - before, before), turn=turn))
+            found.append(Pattern(f"turn_{number}", "turn", relative_change(after - before, level), turn=turn))
     return found
 
 
@@ -190,6 +197,32 @@ def width_patterns(environment: Raster, emitters: list[Emitter]) -> list[Pattern
     return [Pattern("width", "width", bound, lamps=Lamps(*widened(rgb, emitters)))]
 
 
+def lamp_turns(environment: Raster, emitters: list[Emitter]) -> list[Pattern]:
+    """Two turns of every placed lamp by its own sigmas, level and upright; none of any other.
+
+    The middle of a disc of half angle a lies 2 / (pi a) of its light per radian: more no edge can move.
+    """
+    rgb, found = environment.rgb().astype(float), []
+    level = sides(np.maximum(rgb, 0)) if any(map(is_placed, emitters)) else np.zeros((6, 3))
+    for number, emitter in enumerate(emitters):
+        if not is_placed(emitter):
+            continue
+        texels = np.asarray(emitter.texels, int)
+        alone = np.zeros(rgb.shape)
+        alone.reshape(-1, 3)[texels] = rgb.reshape(-1, 3)[texels]
+        share = 2 / (np.pi * max(emitter.half_angle_rad, 1e-9)) * emitter.direction_sigma_rad
+        for word, angles, part in zip(("level", "upright"), np.diag(emitter.direction_sigma_rad), share, strict=True):
+            flat = rgb.reshape(-1, 3).copy()
+            there = emitter.model_copy(update={"direction": turned_to(emitter.direction, *angles)})
+            half = emitter.half_angle_rad
+            moved = measured(flat, draw_disc(flat, texels, there.direction, half), there, half, half)
+            others = [*emitters[:number], moved, *emitters[number + 1 :]]
+            bound = relative_change(min(float(part), 1.0) * sides(alone), level)
+            name = f"turn_{emitter.name}_{word}"
+            found.append(Pattern(name, "turn", bound, lamps=Lamps(flat.reshape(rgb.shape), others)))
+    return found
+
+
 def relative_change(change: np.ndarray, level: np.ndarray) -> float:
     """Largest ratio of the norms over RGB of irradiances (N, 3)."""
     before = np.linalg.norm(level, axis=1)
@@ -209,7 +242,8 @@ def sides(rgb: np.ndarray) -> np.ndarray:
 def worth_following(patterns: list[Pattern], share: float) -> tuple[list[Pattern], list[Pattern]]:
     """Those that are followed to the pixels, and those that together stay below a ``share`` of the squared bounds.
 
-    A width's bound holds in penumbrae alone: it makes no other pattern small, and is left out below what is left out.
+    Bounds of a width and of a lamp's turn hold in penumbrae alone: they make no other pattern small, and are left out
+    below what is left out.
     """
     ordered = sorted((p for p in patterns if p.lamps is None), key=lambda pattern: pattern.bound)
     squares = np.cumsum([pattern.bound**2 for pattern in ordered])

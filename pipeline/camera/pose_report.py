@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.camera.estimates import Estimate
 from pipeline.camera.opencv_bridge import Sightings
+from pipeline.camera.softness import Softness, of_lens
 from pipeline.types import Camera, View
 
 WIDE_ROTATION_DEG = 1.0
@@ -85,3 +86,24 @@ def reasons(orders: dict[str, dict[str, Any]], views: dict[str, View], cameras: 
             **({} if known else {"no_bound": "nobody says how sure the given camera is"}),
         },
     ]
+
+
+def softness_reason(plate: Softness | None, method: str | None, elsewhere: list[str]) -> dict[str, Any]:
+    """Whether the plate's softness was measured; ``elsewhere``: tripod views that tell one where the plate does not.
+
+    ``method``: of the plate's demosaicking.
+    """
+    row: dict[str, Any] = {"term": "softness of the plate", "modelled": plate is not None, "could_cost": ""}
+    if plate is not None:
+        lens = of_lens(plate, method)
+        said = f"lens and pixel {lens.px:.3f} +- {lens.sigma_px:.3f} px (one sigma)"
+        after = f"{plate.edges} edges of the print are {plate.px:.3f} px soft"
+        return {**row, "because": f"{said}; {after}{f' after {method} demosaicking' if method else ''}"}
+    if elsewhere:
+        said = f"the plate shows too few edges of a print; {elsewhere[0]} does"
+        return {**row, "modelled": True, "because": said}
+    return {
+        **row, "because": "no view from the tripod shows enough edges of a board or marker",
+        "could_cost": "borders of objects and shadows that are softer or sharper than the plate's",
+        "no_bound": "nothing says how soft the plate is: the render takes what is usual, and its spread as its sigma",
+    }  # fmt: skip

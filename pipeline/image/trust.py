@@ -16,11 +16,13 @@ BAR_PX, WIDE_PX, FRAME_PX = 34, 560, 8
 COLOURS = {
     "plate": (104, 116, 128), "render": (76, 120, 168), "scale": (245, 133, 24), "flux": (238, 202, 59),
     "sky": (114, 183, 178), "unseen": (160, 160, 160), "turn": (178, 121, 162), "pose": (84, 162, 75),
+    "softness": (255, 157, 166),
 }  # fmt: skip
 OTHER, GROUND = (157, 117, 93), (24, 25, 27)
 MEANINGS = {
     "plate": "noise of the plate", "render": "sampling and denoising", "scale": "scale of the light", "sky": "the sky",
     "flux": "flux of lamps", "unseen": "directions not seen", "turn": "direction of the light", "pose": "pose and lens",
+    "softness": "softness of the plate",
 }  # fmt: skip
 
 

@@ -20,12 +20,17 @@ from pipeline.types import Raster
 
 ALIKE = "insitu:alike_deg"  # in a map's header: width of the cells within which texels err alike
 ALIKE_VIEWS = "insitu:alike_views"  # in a map's header: how many equal views its light is the mean of
+SOFT = "insitu:soft_px"  # in a map's header: softness of each of its views, lens and pixel [px]; absent: not known
 ALIKE_PX = 3.0  # pixels of the probe's picture: demosaicking takes in two to each side
 ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
 RAISED = "raised"  # of a map: what texels' variances were multiplied by because views differ, 1 where not
 # Relative error of a lamp's light by the n pixels that it covers: (POINT exp(-n / FADES), SPREAD n^(-3/4)), squares
 # added, of red and blue, each a quarter of an RGGB mosaic; of green, half of it, a `GREEN` of that. See `sampled`.
 POINT, FADES, SPREAD, GREEN = 3.0, 4.2, 0.32, 0.4
+# The same of a picture whose softness b is known: (TOP exp(-pi^2 b^2 / 2) (1 + a)^(-3/4), BORDER s n^(-1/2)), of a
+# lamp's own a = n - 4 pi s^2 pixels, where s [px] is what a point becomes. See `sampled_behind`.
+TOP, BORDER = 1.75, 0.06
+ADDED_PX2 = 0.72  # variance [px^2] along an axis that demosaicking and looking up add to lens and pixel
 HARDLY = 0.1  # of the brightest channel: no lamp that glows has so little green in ACEScg, only red and blue diodes
 
 
@@ -73,15 +78,65 @@ def sampled(pixels: float) -> np.ndarray:
     along columns, and for green 1/2 along both. A point behind a lens and pixel of b px together has
     ``exp(-2 pi^2 b^2 / 4)`` of its light there, and covers 4 pi b^2 px and what the kernels add, so that its error
     falls with the exponential of the area; the edge of a larger disc has (area)^(-3/4) of that.
-    Constants: lamps of 1 to 150 px on simulated mosaics of four cameras, b evenly from 0.55 to 0.85 px (half the
-    contrast is left at 0.34 to 0.22 cycles per px), 2500 to 6500 K, balls of 45 to 130 px. Which b it was is not known:
-    the blur that is fitted to a ball's rim is off by 0.2 px either way, with what the rim mirrors. A lamp errs three
-    times as much behind the sharpest of these lenses as behind the softest, so errors have heavier tails than normal,
-    and the constants are of largest Student's likelihood: over all lenses intervals of 50, 68 and 95 % hold 52, 69 and
-    91 % of lamps they were not fitted to; behind the sharpest alone 34, 47 and 77: see `benchmarks.sampled_lamps`.
+    Of pictures whose softness is not known (else `sampled_behind`): b evenly from 0.55 to 0.85 px (half the contrast is
+    left at 0.34 to 0.22 cycles per px). A lamp errs three times as much behind the sharpest of these lenses as behind
+    the softest, so errors have heavier tails than normal, and the constants are of largest Student's likelihood: over
+    all lenses intervals of 50, 68 and 95 % hold 55, 72 and 92 % of lamps they were not fitted to; behind the sharpest
+    alone 36, 48 and 77. See `benchmarks.sampled_lamps`.
     """
-    of_quarter = np.hypot(POINT * np.exp(-pixels / FADES), SPREAD * pixels**-0.75)
+    return _of_channels(float(np.hypot(POINT * np.exp(-pixels / FADES), SPREAD * pixels**-0.75)))
+
+
+def sampled_behind(pixels: float, soft_px: float, point_px: float) -> np.ndarray:
+    """As `sampled`, of a picture whose lens and pixel are ``soft_px`` together, and where a point becomes ``point_px``.
+
+    Then how many pixels the lamp has for itself is known: a point covers 4 pi s^2 of them, s = ``point_px``, and areas
+    add. What ends a patch leaves some of the lamp's slope out: BORDER. At each of five softnesses intervals of 50, 68
+    and 95 % hold 45 to 56, 66 to 72 and 94 to 97 % of lamps that no constant was fitted to. Limit: a lens is taken for
+    a Gaussian; the simulator's, of three taps, leaves 1.6 times as much at the photosites' frequency.
+    """
+    own = max(pixels - 4 * np.pi * point_px**2, 0.0)
+    return _of_channels(float(np.hypot(by_photosites(own, soft_px), BORDER * point_px * pixels**-0.5)))
+
+
+def by_photosites(own_px: float, soft_px: float) -> float:
+    """Relative sigma of the light of a disc of ``own_px`` by a quarter of the photosites, by the formula of `sampled`.
+
+    A point has exp(-2 pi^2 b^2 / 4) of its light at their frequency, b = ``soft_px``; a disc of a px has 2 J_1(x) / x
+    of that, x = sqrt(pi a), whose ripples end as a^(-3/4).
+    """
+    return float(TOP * np.exp(-((np.pi * soft_px) ** 2) / 2) * (1 + own_px) ** -0.75)
+
+
+def _of_channels(of_quarter: float) -> np.ndarray:
+    """Relative sigma (3,) by that of a colour which a quarter of the photosites see; no light errs by more than all."""
     return np.asarray(np.minimum(of_quarter * np.array([1, GREEN, 1]), 1))
+
+
+def softness_of(environment: Raster) -> np.ndarray | None:
+    """Softness (V,) [px] of a map's views, lens and pixel together; None for a map that does not say."""
+    stated = environment.attributes.get(SOFT)
+    return None if stated is None else np.array([float(value) for value in str(stated).split()])
+
+
+def views_of(environment: Raster) -> float:
+    """Of how many equal views a map's light is the mean; 1 for a map that does not say."""
+    return float(environment.attributes.get(ALIKE_VIEWS, 1.0))
+
+
+def pixel_rad(environment: Raster) -> float:
+    """Width [rad] of a pixel of the probe's picture; 0 for a map that names no picture."""
+    return float(np.radians(float(environment.attributes.get(ALIKE, 0.0))) / ALIKE_PX)
+
+
+def point_px(environment: Raster, soft_px: float) -> float:
+    """Standard deviation [px] along an axis of what a point becomes in a map that a lens and pixel of ``soft_px`` gave.
+
+    Variances add: lens and pixel; demosaicking (1/2 px^2 of red and blue, 1/4 of green) and looking up between pixels,
+    together `ADDED_PX2` as measured; and a texel's box, once as its light is averaged, once as it is drawn.
+    """
+    texel = np.pi / environment.shape[0] / pixel_rad(environment)
+    return float(np.sqrt(soft_px**2 + ADDED_PX2 + texel**2 / 6))
 
 
 def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
@@ -92,13 +147,18 @@ def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     """
     if ALIKE not in environment.attributes:
         return np.zeros(3)
-    pixel = np.radians(float(environment.attributes[ALIKE]) / ALIKE_PX) ** 2
+    pixel = pixel_rad(environment) ** 2
     solid, sums = latlong_solid_angles(*environment.shape), light.sum((0, 1))
     shape = light[..., 1 if sums[1] > HARDLY * sums.max() else int(np.argmax(sums))]
     squares = float((np.square(shape) / solid).sum())
     covered = float(shape.sum()) ** 2 / squares if squares > 0 else 0.0
-    views = float(environment.attributes.get(ALIKE_VIEWS, 1.0))
-    return sampled(max(covered / pixel, 1.0)) / np.sqrt(views)
+    pixels, views = max(covered / pixel, 1.0), views_of(environment)
+    soft = softness_of(environment)
+    if soft is None:
+        return sampled(pixels) / np.sqrt(views)
+    point = point_px(environment, float(np.sqrt(np.mean(soft**2))))  # the map is the mean of its views
+    each = [sampled_behind(pixels, one, point) for one in soft]
+    return np.asarray(np.sqrt(np.mean(np.square(each), 0) / views))
 
 
 def displaced_sums(values: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ point. Second moments add, so a lamp seen with half angle h by a spread s along 
 centre, so that its second moments become the lamp's and its irradiance stays; what was below stays as sky. A lamp that
 the picture resolves (``a / h`` of `RESOLVED` or more) keeps its shape, at a / h of its size. The shape of a smaller one
 is the picture's more than its own: it becomes the uniform ellipse of its moments.
-A lamp that was recovered from its shadow has its width from there, one that is clipped has none to tell: these stay.
+A recovered lamp that its shadow's edge places (`pipeline.light.placed`) is drawn as the disc that the edge gives; one
+that is clipped has no width to tell, and stays.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from pipeline.conventions import (
     latlong_from_direction,
     latlong_solid_angles,
 )
-from pipeline.light.alike import ALIKE, ALIKE_PX
+from pipeline.light.alike import pixel_rad, point_px, softness_of, views_of
 from pipeline.light.emitters import Sky
+from pipeline.light.placed import draw_disc, is_placed
 from pipeline.types import Emitter, Raster
 
-# Standard deviation along an axis of what a point becomes in a map, in pixels of the probe's picture: the pixel's box,
-# the lens, demosaicking and the texels it is spread over. The moments of six lamps whose true widths are known, 4 to 7
-# degrees, in balls of 31 to 87 px, under a lens (with the pixel) of 0.55 px give 0.92 to 1.03, 0.98 on average; a lens
-# of 0.85 px would give 1.17, and nothing tells how soft one is.
-SPREAD_PX = 1.02
-SPREAD_SIGMA = 0.08  # relative
+# What a point becomes in a map, in pixels of the probe's picture, where nothing tells how soft that is (else
+# `pipeline.light.alike.point_px`): the middle of lenses of 0.55 to 0.85 px, with the pixel. Relative sigmas: of these
+# lenses, and of one lamp in one view, whose place on mosaic and ball counts. See `benchmarks.sampled_lamps`.
+SPREAD_PX = 1.11
+LENS_SIGMA, LAMP_SIGMA = 0.05, 0.095
 TEXELS = 2.0  # of the map that a lamp's radius is to hold, at least
 FINEST = 2048  # columns; a map that is finer already stays
 RESOLVED = 0.9  # of half angles, true over seen, from which on a lamp's shape is its own
@@ -48,7 +49,16 @@ class Drawn:
 
 def spread_of(environment: Raster) -> float:
     """Standard deviation [rad] along an axis of what a point becomes in a map; 0 where it names no picture."""
-    return SPREAD_PX * np.radians(float(environment.attributes.get(ALIKE, 0.0))) / ALIKE_PX
+    pixel, soft = pixel_rad(environment), softness_of(environment)
+    if soft is None or pixel == 0:
+        return SPREAD_PX * pixel
+    return point_px(environment, float(np.sqrt(np.mean(soft**2)))) * pixel
+
+
+def spread_sigma_of(environment: Raster) -> float:
+    """Relative standard uncertainty of `spread_of`, of one lamp."""
+    of_lens = LENS_SIGMA if softness_of(environment) is None else 0.0
+    return float(np.hypot(of_lens, LAMP_SIGMA / np.sqrt(views_of(environment))))
 
 
 def half_angle_of(seen_rad: float, spread_rad: float) -> float:
@@ -167,7 +177,7 @@ def within(texels: np.ndarray, width: int, factor: int) -> np.ndarray:
 
 
 def drawn(environment: Raster, emitters: list[Emitter], spread_rad: float) -> Drawn:
-    """The map with every measured lamp as wide as it is; finer where that takes smaller texels.
+    """The map with every measured and every placed lamp as wide as it is; finer where that takes smaller texels.
 
     A lamp's texels are then those that it is drawn on; its ``irradiance`` is what they hold, its sigma stays.
     Variances go with the square of the light: they are relative to what a texel shows.
@@ -180,21 +190,28 @@ def drawn(environment: Raster, emitters: list[Emitter], spread_rad: float) -> Dr
         if emitter.evidence == "measured" and spread_rad > 0
     }
     seen = {number: picture for number, picture in seen.items() if picture.half_angle_rad > 0}
-    if not seen:
+    placed = [emitter for emitter in emitters if is_placed(emitter)]
+    if not seen and not placed:
         return Drawn(environment, emitters)
     narrow = [half_angle_of(picture.half_angle_rad, spread_rad) for picture in seen.values()]
+    narrow += [emitter.half_angle_rad for emitter in placed]
     factor = columns_for(columns, narrow) // columns
     fine = finer(environment, factor)
     rgb, moved = fine.rgb().astype(float).reshape(-1, 3), []
-    before = rgb.copy()
+    before, unsure = rgb.copy(), spread_sigma_of(environment)
     for number, emitter in enumerate(emitters):
         texels = np.asarray(emitter.texels, int)
         parts = within(texels, columns, factor)
+        if is_placed(emitter):
+            half = emitter.half_angle_rad
+            landed = draw_disc(rgb, parts, emitter.direction, half)
+            moved.append(measured(rgb, landed, emitter, half, half + emitter.half_angle_sigma_rad))
+            continue
         if number not in seen:
             moved.append(emitter.model_copy(update={"texels": parts}))
             continue
         picture, on = seen[number], (rows, rows * factor)
-        true, wider = (half_angle_of(picture.half_angle_rad, spread_rad * s) for s in (1, 1 - SPREAD_SIGMA))
+        true, wider = (half_angle_of(picture.half_angle_rad, spread_rad * s) for s in (1, 1 - unsure))
         if true >= RESOLVED * picture.half_angle_rad:
             ratio = true / picture.half_angle_rad
             landed, gained = resized(picture.radiance, texels, emitter.direction, ratio, on)

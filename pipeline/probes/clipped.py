@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import latlong_solid_angles
+from pipeline.light.placed import SUN_HALF_ANGLE, Placed, disc_texels
 from pipeline.probes.clipped_lights import PART, Light, find_lights, held_by
 from pipeline.probes.observation import ViewMap
-from pipeline.probes.shadow_edge import SUN_HALF_ANGLE, Edge, disc_texels
+from pipeline.probes.shadow_edge import Edge
 from pipeline.probes.shadow_flux import (
     LEAST,
     WIDEST,
@@ -54,12 +55,16 @@ NOTHING = {
 
 @dataclass(frozen=True)
 class Recovered:
-    """The map (H, W, 3) with what could be recovered, its variance, and per texel (H, W): clipped, recovered."""
+    """The map (H, W, 3) with what could be recovered, its variance, and per texel (H, W): clipped, recovered.
+
+    ``placed``: the lamps that are discs where their shadows' edges say.
+    """
 
     rgb: np.ndarray
     variance: np.ndarray
     clipped: np.ndarray
     recovered: np.ndarray
+    placed: list[Placed] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
@@ -75,7 +80,7 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
     if not found:
         nowhere = np.zeros(clipped.shape)
         numbers = {"clipped_lights": [], **_bounds(rgb, clipped, nowhere)}
-        return Recovered(rgb, variance, clipped, nowhere, numbers, evidence=[NOTHING])
+        return Recovered(rgb, variance, clipped, nowhere, numbers=numbers, evidence=[NOTHING])
     asked, refused = _asked(found)
     verdicts = dict(refused)
     rest = setting(rgb, np.where(held_by(clipped.shape, found)[..., None], 0, variance), [light for _, light in asked])
@@ -84,13 +89,15 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
         answers = [replace(answer, refused=answer.refused or vague) for answer in answers]
     out, spread, recovered = np.array(rgb, float), np.array(variance, float), np.zeros(clipped.shape)
     rows: list[dict[str, Any]] = []
+    placed: list[Placed] = []
     for number, light in enumerate(found, 1):
         place = next((at for at, (other, _) in enumerate(asked) if other == number), None)
         answer = answers[place] if place is not None else None
         why = verdicts.get(number) or (answer.refused if answer else "")
         if answer is not None and not why:
             recovered.ravel()[light.texels] = 1
-            light = narrowed(out, spread, light, answer.edge)
+            whole, light = light, narrowed(out, spread, light, answer.edge)
+            placed += [place_of(answer.edge)] if answer.edge is not None and light is not whole else []
             _put(out, spread, light, answer)
             recovered.ravel()[light.texels] = 1
         rows.append(_row(light, answer, why, rest))
@@ -100,7 +107,7 @@ def recover(rgb: np.ndarray, variance: np.ndarray, clipped: np.ndarray, seen: Wi
         warnings.append(f"{small} more clipped spots hold less than {MATTERS:.1%} of the light each, as lower bounds")
     evidence = [_reason(number, row) for number, row in enumerate(rows, 1) if row["matters"] or not row["lower_bound"]]
     numbers = {"clipped_lights": rows, **numbers, **_bounds(out, clipped, recovered)}
-    return Recovered(out, spread, clipped, recovered, numbers, warnings, evidence)
+    return Recovered(out, spread, clipped, recovered, placed, numbers, warnings, evidence)
 
 
 def _bounds(rgb: np.ndarray, clipped: np.ndarray, recovered: np.ndarray) -> dict[str, Any]:
@@ -226,6 +233,7 @@ def _row(light: Light, answer: Answer | None, why: str, rest: Setting) -> dict[s
         "edge_half_angle_deg": float(np.degrees(answer.edge.half_angle)) if answer and answer.edge else None,
         "edge_half_angle_sigma_deg": float(np.degrees(answer.edge.sigma)) if answer and answer.edge else None,
         "edge_blur_px": answer.edge.blur_px if answer and answer.edge else None,
+        "direction_sigma_deg": np.degrees(answer.edge.direction_sigma).tolist() if answer and answer.edge else None,
         "condition": answer.condition if told and answer else None, "why_not": why, "share": share,
         "matters": share > MATTERS,
     }  # fmt: skip
@@ -269,6 +277,15 @@ def clipped_share(share: np.ndarray, maps: list[ViewMap]) -> np.ndarray:
 def believed(light: Light, edge: Edge) -> bool:
     """Whether the edge of its shadow says by twice its sigma that a lamp is narrower than its clipped picture."""
     return edge.half_angle + 2 * edge.sigma <= NARROWER * light.half_angle
+
+
+def place_of(edge: Edge) -> Placed:
+    """The disc as it is drawn: no narrower than the sun, and as unsure of its square as the edge is."""
+    half = max(edge.half_angle, SUN_HALF_ANGLE)
+    square = (edge.half_angle + edge.sigma) ** 2 - edge.half_angle**2
+    x, y, z = (float(part) for part in edge.direction)
+    level, upright = (float(part) for part in edge.direction_sigma)
+    return Placed((x, y, z), half, float(np.sqrt(half**2 + square)) - half, (level, upright))
 
 
 def narrowed(out: np.ndarray, spread: np.ndarray, light: Light, edge: Edge | None) -> Light:

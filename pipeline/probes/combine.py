@@ -12,19 +12,20 @@ import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_solid_angles, transform_points
-from pipeline.light.alike import ALIKE_PX
+from pipeline.light.alike import ALIKE, ALIKE_PX, ALIKE_VIEWS, SOFT
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.filling import enlarge
 from pipeline.probes.levelling import precision
 from pipeline.probes.observation import Quality, ViewMap
-from pipeline.types import Camera
+from pipeline.types import Camera, View
 
 WEIGHT_ROWS = 64  # rows of the grid on which views are weighed: cells of 2.8 degrees, wider than views are displaced
 LEAST_SHARE = 0.05  # of the weight: a view that has less was set aside, and does not contradict
 FLOOR = 0.003  # relative: below it two views are equally good
 PLATE_SPLIT, PLATE_SIGMA_PX = 2, 0.5  # lookups per texel and axis; blur and misplacement of the plate's pixels
 SIGNIFICANT = 3.0  # standard deviations
+SHARPEST_PX = 0.4  # of lens and pixel: an edge sharper than that was sharpened by a camera
 
 
 def ramp(inside: np.ndarray, fade: float) -> np.ndarray:
@@ -93,6 +94,25 @@ def equal_views(merged: Merged) -> str:
     light = latlong_solid_angles(*merged.seen.shape) * np.maximum(merged.rgb.mean(-1), 0) * (merged.share.sum(0) > 0)
     squares = float((light * (merged.share**2).sum(0)).sum())
     return f"{float(light.sum()) / squares if squares > 0 else 1.0:.4g}"
+
+
+def picture_header(merged: Merged, maps: dict[str, ViewMap], views: dict[str, View]) -> dict[str, str]:
+    """What a map's header says of the pictures it is from, ``maps`` by view; ``views`` may lack one that is no picture.
+
+    Nothing when no map says how large its pixels are; no softness when that of one view is not known.
+    """
+    degrees = alike_deg(list(maps.values()))
+    soft = soft_px([views[name].softness_px if name in views else None for name in maps])
+    if degrees is None:
+        return {}
+    told = {} if soft is None else {SOFT: " ".join(f"{one:.4g}" for one in soft)}
+    return {ALIKE: f"{degrees:.4g}", ALIKE_VIEWS: equal_views(merged), **told}
+
+
+def soft_px(measured: list[float | None]) -> np.ndarray | None:
+    """Softness (V,) [px] of lens and pixel of each view; None where one is not known, or is not a lens's."""
+    known = np.array([one for one in measured if one is not None])
+    return None if len(known) < len(measured) or (known < SHARPEST_PX).any() else known
 
 
 def sum_of(share: np.ndarray, maps: list[np.ndarray]) -> np.ndarray:

@@ -21,7 +21,7 @@ class Witness:
 
     ``cards``: surfaces of known reflectance. ``shift`` (3,): one standard deviation
     of the ball's centre [m] on the plane, along the axis where it is largest, world frame; ``eye`` (3,): the camera.
-    ``scale_sigma`` (3,): relative, of the whole map.
+    ``place`` (3, 3): covariance of the ball's centre [m^2], world. ``scale_sigma`` (3,): relative, of the whole map.
     """
 
     ball: ball_shadow.Ball | None = None
@@ -29,6 +29,7 @@ class Witness:
     cards: Cards = field(default_factory=Cards)
     scale_sigma: np.ndarray | float = 0.0
     shift: np.ndarray | None = None
+    place: np.ndarray | None = None
     eye: np.ndarray | None = None
     missing: str = "no photograph of the ball from the tripod"
 
@@ -45,10 +46,11 @@ def witness_of(shots: Shots, observed: Observation) -> Witness:
         fit, pose = observed.balls[name], shots.views[name].world_from_camera
         blocks = plane_blocks(shots.photographs[name], shots.photographs["plate"], shots.camera, pose, fit)
         centre = transform_points(pose, fit.centre_camera_m)
-        values, axes = np.linalg.eigh(LEVEL @ pose[:3, :3] @ fit.covariance @ pose[:3, :3].T @ LEVEL)
+        place = pose[:3, :3] @ fit.covariance @ pose[:3, :3].T
+        values, axes = np.linalg.eigh(LEVEL @ place @ LEVEL)
         return Witness(
             ball_shadow.Ball(centre, fit.radius_m, fit.reflectance), blocks, cards,
-            shift=axes[:, -1] * np.sqrt(values[-1]), eye=pose[:3, 3],
+            shift=axes[:, -1] * np.sqrt(values[-1]), place=place, eye=pose[:3, 3],
             scale_sigma=scale, missing="the plane beside the ball cannot be compared with the plate",
         )  # fmt: skip
     return Witness(cards=cards, scale_sigma=scale)
