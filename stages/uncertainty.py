@@ -12,6 +12,7 @@ Limits: first order; what the objects reflect is taken as wished; what no stage 
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from pipeline.budget import geometry, light, pixels
 from pipeline.budget.response import DIMMER, STEP_RAD, Grid, Layers, Response, Seen, points_on, rendered
 from pipeline.conventions import ACESCG
 from pipeline.light.alike import shared_sigma_of
-from pipeline.light.environment import irradiance
+from pipeline.light.environment import irradiance, resize_environment
 from pipeline.light.placed import is_placed, without_placed
 from pipeline.run import artifacts as A
 from pipeline.run.evidence import not_covered
@@ -52,11 +53,13 @@ def compute(
     size = np.abs(layers.rgb("lost")) + np.abs(layers.rgb("gained"))
     share = np.divide(np.abs(layers.rgb("lost")), size, out=np.full(size.shape, 0.5), where=size > 0)
     on_change = share * on_lost + (1 - share) * on_gained
-    remaining, sampled = (
+    usual = pixels.TYPICAL
+    remaining, sampled, intervals = (
         pixels.render_variance(on_change, layers.rgb("without"), composite.rgb("obj"), change, obj * free)
         for change, obj in (
             (layers["noise.change"], layers["noise.obj"]),
             (rms(layers.rgb("variance")), rms(layers.rgb("objvariance"))),
+            (usual["shadow"] * layers["noise.change"], usual["object"] * layers["noise.obj"]),
         )
     )
     shown = pixels.plate_variance(mul, plate.rgb("variance"))
@@ -86,7 +89,7 @@ def compute(
         numbers = {"step_px": grid.step, "traced_px": int(grid.chosen.sum()), "followed": [p.name for p in followed]}
         evidence = reasons(followed, left, params.share)
     picture = composite.rgb()
-    typical = pixels.of_intervals(own)
+    typical = own | {"render": intervals}
     variance = pixels.total_variance(list(typical.values()), modes, window)
     fall = pixels.waterfall(picture, plate.rgb(), composite["obj.A"], own, means, modes, window)
     unknown = int((~np.isfinite(variance)).any(-1).sum())
@@ -137,6 +140,19 @@ class Studio:
     def upward(self, rgb: np.ndarray) -> np.ndarray:
         """Irradiance (3,) on the plane."""
         return np.asarray(irradiance(rgb, self.plane.normal[None])[0])
+
+    @functools.cached_property
+    def sky(self) -> np.ndarray:
+        """The map (H, W, 3) without emitters, on no more than `light.SKY_MAP`."""
+        rest = self.rgb.copy()
+        for emitter in self.emitters:
+            rest.reshape(-1, 3)[np.asarray(emitter.texels, int)] = 0
+        return rest if len(rest) <= light.SKY_MAP[0] else resize_environment(rest, *light.SKY_MAP)
+
+    @functools.cached_property
+    def under_sky(self) -> Seen:
+        """A render under it."""
+        return self.seen(self.sky, [])
 
     @functools.cached_property
     def surfaces(self) -> Worlds:
@@ -246,6 +262,8 @@ def light_modes(studio: Studio, full: Layers, followed: list[light.Pattern]) -> 
             rest = without_placed(studio.rgb, studio.emitters)
             moved = light.turned(rest, step) + studio.rgb - rest
             apart = studio.seen(moved, moved_emitters(studio, step)).minus(whole)
+            # Objects by the sky alone: highlights of lamps are met by the grid's squares by chance, and keep their sum.
+            apart = replace(apart, obj=studio.seen(light.turned(studio.sky, step), []).obj - studio.under_sky.obj)
             share = (studio.upward(moved) - studio.irradiance) / studio.irradiance
             change = angle / STEP_RAD * response.of_turn(apart, share)
         modes.append(pixels.Mode(pattern.name, pattern.source, change.astype(np.float32)))
@@ -259,10 +277,7 @@ def moved_emitters(studio: Studio, turn: np.ndarray) -> list[Emitter]:
         if is_placed(emitter):
             moved.append(emitter)
             continue
-        alone = np.zeros((*studio.rgb.shape[:2], 1))
-        alone.reshape(-1)[np.asarray(emitter.texels, int)] = 1.0
-        covered = light.turned(alone, turn)[..., 0]
-        texels = np.flatnonzero(covered > 0.5 * covered.max())  # a lamp of one texel may lie on four by a quarter each
+        texels = light.turned_texels(np.asarray(emitter.texels, int), studio.rgb.shape[0], turn)
         moved.append(emitter.model_copy(update={"texels": texels}))
     return moved
 

@@ -116,6 +116,18 @@ def test_a_turned_map_is_the_light_from_elsewhere():
     assert light.turned(rgb, np.zeros(3)) == pytest.approx(rgb)
 
 
+def test_a_turned_lamp_takes_its_border_along():
+    """Every texel on which the turned map shows a lamp is the lamp's, and no more than two about them."""
+    height, random = 64, np.random.default_rng(5)
+    for start in (40 * 128 + 60, 10 * 128 + 127, 2 * 128 + 3):  # the second at the seam, the third near the pole
+        texels, alone = np.array([start, start + 128]), np.zeros((height, 128, 1))
+        alone.reshape(-1)[texels] = 1
+        turn = 0.02 * random.standard_normal(3)
+        found = light.turned_texels(texels, height, turn)
+        assert np.isin(np.flatnonzero(light.turned(alone, turn)), found).all()
+        assert len(found) <= 2 * 25
+
+
 def test_ball_off_centre_turns_the_map_by_twice_its_tilt():
     radius, sigma = 0.04, 1e-4
     ball = BallFit(
@@ -364,14 +376,6 @@ def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
     budget = json.loads((desk_build / "uncertainty" / "budget.json").read_text())
     assert "near field: the map at the objects" in {row["term"] for row in budget["not_covered"]}
     assert 0.001 < budget["regions"]["object"]["mean_rel"]["total"] < 0.02
-
-
-def test_intervals_of_pixels_take_the_share_of_a_tile_that_typical_pixels_have():
-    """The plate's noise is each pixel's own; of the render's, a tile's RMS is what few bad pixels make it."""
-    own = {"plate": np.full((2, 2, 3), 4.0), "render": np.full((2, 2, 3), 1.0)}
-    found = pixels.of_intervals(own)
-    assert (found["plate"] == own["plate"]).all()
-    assert found["render"] == pytest.approx(pixels.TYPICAL**2 * own["render"])
 
 
 def test_likelihood_tells_which_source_is_overstated():

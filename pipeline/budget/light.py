@@ -18,7 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.rigid import rotation_exp, skew
-from pipeline.conventions import latlong_directions, latlong_from_direction, latlong_solid_angles
+from pipeline.conventions import (
+    direction_from_latlong,
+    latlong_directions,
+    latlong_from_direction,
+    latlong_solid_angles,
+)
 from pipeline.light.alike import alike_rows, cell_sums, own_sigma
 from pipeline.light.environment import AXES, AXIS_NAMES, irradiance, resize_environment, total_energy
 from pipeline.light.narrowing import measured, widened
@@ -176,6 +181,21 @@ def turned(rgb: np.ndarray, turn: np.ndarray) -> np.ndarray:
     result = upper * (1 - down) + lower * down
     energy = total_energy(result)
     return np.asarray(result * np.divide(total_energy(rgb), energy, out=np.ones(len(energy)), where=energy > 0))
+
+
+def turned_texels(texels: np.ndarray, height: int, turn: np.ndarray) -> np.ndarray:
+    """(M,) texels of a map of ``height`` rows on which `turned` leaves light of ``texels`` (N,), and those about them.
+
+    What of a lamp is left to the sky, few samples meet; what of the sky is taken for a lamp, as many as the lamp.
+    """
+    width = 2 * height
+    row, column = np.divmod(texels, width)
+    directions = direction_from_latlong((column + 0.5) / width, (row + 0.5) / height)
+    u, v = latlong_from_direction(directions @ rotation_exp(turn).T)
+    right, down = np.meshgrid(np.arange(-2, 3), np.arange(-2, 3))
+    rows = np.clip((v * height).astype(int)[:, None] + down.ravel(), 0, height - 1)
+    columns = ((u * width).astype(int)[:, None] + right.ravel()) % width
+    return np.unique(rows * width + columns)
 
 
 def width_patterns(environment: Raster, emitters: list[Emitter]) -> list[Pattern]:

@@ -18,10 +18,11 @@ import numpy as np
 # independent photosites: 4 / (9/16) = 7.1 for red and blue, 2 / (5/8) = 3.2 for green; camera to ACEScg mixes them.
 PLATE_PX = 5.0
 # Of the RMS error that a tile of the denoised render has, what a pixel's intervals need: few bad pixels (highlights,
-# borders of shadows) make most of a tile's mean square. `python -m benchmarks.denoised_noise`, counter's draft, five
-# seeds of 16 samples against 160: 50, 68 and 95 % intervals of the RMS itself hold 74, 86 and 97 % of object pixels and
-# 78, 89 and 98 % of shadow pixels; of this share of it 55, 70 and 90, and 60, 74 and 93 %. The plate's lens is in it.
-TYPICAL = 0.6
+# borders of shadows) make most of a tile's mean square. `python -m benchmarks.denoised_noise`, counter's draft as soft
+# as its plate, five seeds of 16 samples against 160: 50, 68, 95 % intervals of the RMS itself hold 74, 86 and 97 % of
+# object pixels and 78, 89 and 98 % of shadow pixels; of these shares of it 49, 64 and 87, and 60, 74 and 93 %. Objects
+# of desk and courtyard, photographed eight times each, would have 0.5.
+TYPICAL = {"object": 0.52, "shadow": 0.6}
 SHADOW = 0.05  # relative change of the plate that is called a shadow, as `evaluate` has it
 COVERED = 0.999
 
@@ -62,11 +63,6 @@ def of_means(plate: np.ndarray, samples: np.ndarray) -> np.ndarray:
     ``plate``: the plate's part; ``samples``: the render's before it was denoised; both (H, W, 3).
     """
     return np.asarray(PLATE_PX * plate + samples)
-
-
-def of_intervals(own: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The pixels' own variances (H, W, 3) by source, the render's as the intervals of single pixels need it."""
-    return {source: TYPICAL**2 * part if source == "render" else part for source, part in own.items()}
 
 
 def total_variance(own: list[np.ndarray], modes: list[Mode], window: tuple[slice, slice]) -> np.ndarray:
