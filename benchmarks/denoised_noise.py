@@ -69,7 +69,7 @@ def main() -> None:
     for name, where in places.items():
         error = np.stack([shown(layers)[name][0] - truth[name][0] for layers in runs])[:, where]
         sigma = np.stack([shown(layers)[name][1] for layers in runs])[:, where]
-        for share in (1.0, TYPICAL[name]):
+        for share in (1.0, TYPICAL):
             z = np.abs(error) / np.maximum(share * sigma, 1e-12)
             held = ", ".join(f"{100 * (z < limit).mean():.0f}" for limit in QUANTILES.values())
             say(f"{name}: of {share:g} of what is stated, 50, 68 and 95 % intervals hold {held} %")

@@ -8,9 +8,12 @@ the matrix where that is asked for. Data without a mosaic come from the space th
 model use one profile; another model has its own matrices, and its neutral is how it would see the plate's white:
 however either was set, plate and ball agree. Variances go through squared kernels and squared matrix.
 
-Limits: interpolation error is not in the variance (at edges it exceeds the noise), nor is the covariance of
-neighbouring pixels and channels that kernels and matrix make. Values that touched a clipped photosite are lower bounds:
-they carry CLIPPED and an infinite variance. Negative and out-of-gamut values are kept and counted.
+What interpolation errs besides the noise, which it exceeds at edges, is no part of the variance, as it hides nothing:
+the plate has it apart (``interpolation.RGB``), for the uncertainty of its pixels.
+
+Limits: the covariance of neighbouring pixels and channels that kernels and matrix make is not in the variance. Values
+that touched a clipped photosite are lower bounds: they carry CLIPPED and an infinite variance. Negative and
+out-of-gamut values are kept and counted.
 """
 
 from __future__ import annotations
@@ -68,6 +71,8 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
     shown_in = "plate" if "plate" in views else views[0]
     if mosaics[shown_in].attributes["insitu:cfa"]:
         numbers["interpolation"] = edge_error(mosaics[shown_in], acescg_of(profiles[shown_in], shown_in))
+        if shown_in == "plate":
+            photographs["plate"].channels.update(interpolation(mosaics["plate"], acescg_of(profiles["plate"], "plate")))
         evidence.append(_interpolation(shown_in, numbers["interpolation"]))
     evidence = [*losses.evidence(views, profiles, {view: mosaics[view].shape for view in views}), *evidence]
     warnings += losses.warnings
@@ -94,6 +99,17 @@ def _negative(view: str, photograph: Raster, count: int) -> list[str]:
     ]
 
 
+def interpolation(mosaic: Raster, acescg_from_camera: np.ndarray) -> dict[str, np.ndarray]:
+    """Channels ``interpolation.RGB`` (H, W), ACEScg: squared error that interpolation makes besides the noise."""
+    neutral = np.linalg.solve(acescg_from_camera, np.ones(3))
+    cfa = str(mosaic.attributes["insitu:cfa"])
+    gains = balance_gains(neutral, cfa, mosaic.shape)
+    variance = mosaic["variance"] * gains * gains
+    spread = interpolation_variance(mosaic["Y"] * gains, np.where(np.isfinite(variance), variance, 0), cfa)
+    squared = colour.apply_matrix((acescg_from_camera * neutral) ** 2, spread)
+    return Raster.split(squared.astype(np.float32), "interpolation")
+
+
 def edge_error(mosaic: Raster, acescg_from_camera: np.ndarray) -> dict[str, float]:
     """How large the error of interpolation is in the middle of a mosaic, white balanced, against its noise."""
     cfa, (height, width) = str(mosaic.attributes["insitu:cfa"]), mosaic.shape
@@ -117,9 +133,9 @@ def edge_error(mosaic: Raster, acescg_from_camera: np.ndarray) -> dict[str, floa
 
 def _interpolation(view: str, numbers: dict[str, float]) -> dict[str, Any]:
     return {
-        "term": "interpolation error in the variance",
-        "modelled": False,
-        "because": f"it is no noise; beyond the noise in {numbers['beyond_noise_fraction']:.0%} of {view}'s middle",
+        "term": "interpolation error of the pixels",
+        "modelled": view == "plate",
+        "because": f"where kernels disagree: beyond noise in {numbers['beyond_noise_fraction']:.0%} of {view}'s middle",
         "could_cost": f"values there are off by {numbers['median_rel']:.1%} (median), {numbers['p95_rel']:.1%} (95 %)",
         "bound_rel": numbers["p95_rel"],
     }

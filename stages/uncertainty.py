@@ -53,17 +53,16 @@ def compute(
     size = np.abs(layers.rgb("lost")) + np.abs(layers.rgb("gained"))
     share = np.divide(np.abs(layers.rgb("lost")), size, out=np.full(size.shape, 0.5), where=size > 0)
     on_change = share * on_lost + (1 - share) * on_gained
-    usual = pixels.TYPICAL
     remaining, sampled, intervals = (
         pixels.render_variance(on_change, layers.rgb("without"), composite.rgb("obj"), change, obj * free)
         for change, obj in (
             (layers["noise.change"], layers["noise.obj"]),
             (rms(layers.rgb("variance")), rms(layers.rgb("objvariance"))),
-            (usual["shadow"] * layers["noise.change"], usual["object"] * layers["noise.obj"]),
+            (pixels.TYPICAL * layers["noise.change"], pixels.TYPICAL * layers["noise.obj"]),
         )
     )
     shown = pixels.plate_variance(mul, plate.rgb("variance"))
-    own = {"plate": shown, "render": remaining}
+    own = {"plate": shown + pixels.plate_variance(mul, interpolated(plate)), "render": remaining}
     means = {"plate": pixels.PLATE_PX * shown, "render": sampled}
     changed = (size > FOLLOWED_CHANGE * layers.rgb("without")).any(-1) & (layers["ground"] > 0)
     wanted = ((layers["obj.A"] > 0) | changed) & (free > 0)
@@ -182,6 +181,12 @@ class Studio:
         They are part of a compiled kernel, so that lights of one kind need one kernel.
         """
         return rendered(relit(unlit, rgb, emitters), self.rays, self.grid, self.samples, DEPTH, seed=1)
+
+
+def interpolated(plate: Raster) -> np.ndarray:
+    """(H, W, 3) squared error of the plate's interpolation: each pixel's own, and none of a region's mean."""
+    named = "interpolation.R" in plate.channels
+    return plate.rgb("interpolation") if named else np.zeros((*plate.shape, 3), np.float32)
 
 
 def rms(variance: np.ndarray) -> np.ndarray:

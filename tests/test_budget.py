@@ -369,9 +369,10 @@ def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
     assert np.sqrt(parts) == pytest.approx(sigma, rel=2e-3)
     alone = (layers["influence"] == 0) & (layers["obj.A"] == 0)
     assert alone.any()
-    assert sigma[alone] == pytest.approx(np.sqrt(plate.rgb("variance")[alone]), rel=2e-3)
+    own = np.sqrt(plate.rgb("variance") + plate.rgb("interpolation"))
+    assert sigma[alone] == pytest.approx(own[alone], rel=2e-3)
     covered = layers["obj.A"] > 0.999
-    own = np.sqrt(plate.rgb("variance")[covered])
+    own = own[covered]
     assert (unsure.rgb("plate")[covered] <= 1.01e-3 * own).all()  # no more of the plate is left there; 16 bit
     budget = json.loads((desk_build / "uncertainty" / "budget.json").read_text())
     assert "near field: the map at the objects" in {row["term"] for row in budget["not_covered"]}

@@ -20,9 +20,9 @@ PLATE_PX = 5.0
 # Of the RMS error that a tile of the denoised render has, what a pixel's intervals need: few bad pixels (highlights,
 # borders of shadows) make most of a tile's mean square. `python -m benchmarks.denoised_noise`, counter's draft as soft
 # as its plate, five seeds of 16 samples against 160: 50, 68, 95 % intervals of the RMS itself hold 74, 86 and 97 % of
-# object pixels and 78, 89 and 98 % of shadow pixels; of these shares of it 49, 64 and 87, and 60, 74 and 93 %. Objects
+# object pixels and 78, 89 and 98 % of shadow pixels; of this share of it 49, 64 and 87, and 55, 69 and 90 %. Objects
 # of desk and courtyard, photographed eight times each, would have 0.5.
-TYPICAL = {"object": 0.52, "shadow": 0.6}
+TYPICAL = 0.52
 SHADOW = 0.05  # relative change of the plate that is called a shadow, as `evaluate` has it
 COVERED = 0.999
 

@@ -29,6 +29,7 @@ from pipeline.transport.trace import LensRays, Rays, Samples, seen_points, trace
 STEP_RAD = 0.02  # of a turn that is rendered: well above rounding, below the width of a lamp's penumbra
 DIMMER = 0.8  # albedo of the ground in the second render, relative: the derivative by it comes from the difference
 SMOOTHED = 3  # squares of the grid over which renders are summed before they are divided
+STEEP = 0.05  # of the steepest slope of a shadow, alone in a square of the grid: less is no edge
 LAYERS = ("lost", "gained", "obj")
 MOST_RATIO = 4.0  # of a pattern's part in the whole: beyond, the whole is too faint to be divided by
 
@@ -122,6 +123,13 @@ def share_of(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(ratio, -MOST_RATIO, MOST_RATIO))
 
 
+def boxed(values: np.ndarray, side: int) -> np.ndarray:
+    """Means (h, w, C) over squares of ``side`` pixels, zero outside the picture."""
+    from scipy.ndimage import uniform_filter
+
+    return np.asarray(uniform_filter(values, (side, side, 0), mode="constant"))
+
+
 @dataclass(frozen=True, eq=False)
 class Layers:
     """The full pictures that renders of the grid are taken relative to, within the grid's window (h, w, 3)."""
@@ -169,8 +177,20 @@ class Response:
         """When the light moves: by the difference of two renders, whose sign changes over an edge, so not relative."""
         lost, gained, obj = (self.grid.enlarged(summed(getattr(apart, name)) / SMOOTHED**2) for name in LAYERS)
         full = self.layers
+        lost = self.at_edges(lost, full.lost)
         moved = full.changed(np.minimum(full.lost + lost, 0) - full.lost, gained, obj)
         return moved + self._changed(dict.fromkeys(LAYERS, 0.0), irradiance_share, 1.0)
+
+    def at_edges(self, change: np.ndarray, layer: np.ndarray) -> np.ndarray:
+        """A change (h, w, 3) that the grid shows, where the full ``layer`` says that it happens: in ratio to its slope.
+
+        What moves a shadow changes it at its edge, which may be a pixel wide, and the grid's squares many.
+        """
+        slope = np.hypot(*(np.gradient(layer, axis=axis) if layer.shape[axis] > 1 else 0 * layer for axis in (0, 1)))
+        side = SMOOTHED * self.grid.step
+        around = boxed(slope, side)
+        ratio = np.divide(slope, around, out=np.ones_like(slope), where=around > STEEP * slope.max(initial=0.0) / side)
+        return np.asarray(change * ratio)
 
     def _changed(self, shares: dict[str, Any], irradiance_share: np.ndarray, factor: np.ndarray | float) -> np.ndarray:
         """``factor * shares`` of every layer, less what the albedo undoes."""

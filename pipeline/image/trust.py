@@ -20,7 +20,8 @@ COLOURS = {
 }  # fmt: skip
 OTHER, GROUND = (157, 117, 93), (24, 25, 27)
 MEANINGS = {
-    "plate": "noise of the plate", "render": "sampling and denoising", "scale": "scale of the light", "sky": "the sky",
+    "plate": "noise and interpolation of the plate",
+    "render": "sampling and denoising", "scale": "scale of the light", "sky": "the sky",
     "flux": "flux of lamps", "unseen": "directions not seen", "turn": "direction of the light", "pose": "pose and lens",
     "softness": "softness of the plate",
 }  # fmt: skip

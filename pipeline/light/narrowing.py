@@ -67,7 +67,10 @@ def half_angle_of(seen_rad: float, spread_rad: float) -> float:
 
 
 def columns_for(width: int, half_angles: list[float]) -> int:
-    """Columns of a map, ``width`` times a power of two, whose texels show the narrowest lamp; `FINEST` at most."""
+    """Columns of a map, ``width`` times a power of two, whose texels show the narrowest lamp; `FINEST` at most.
+
+    Of a lamp that may be wider by a sigma, that is its width: texels finer than what is known show nothing more.
+    """
     columns = width
     while columns < FINEST and min(half_angles) * columns / (2 * np.pi) < TEXELS:
         columns *= 2
@@ -193,12 +196,15 @@ def drawn(environment: Raster, emitters: list[Emitter], spread_rad: float) -> Dr
     placed = [emitter for emitter in emitters if is_placed(emitter)]
     if not seen and not placed:
         return Drawn(environment, emitters)
-    narrow = [half_angle_of(picture.half_angle_rad, spread_rad) for picture in seen.values()]
+    unsure = spread_sigma_of(environment)
+    narrow = [
+        max(half_angle_of(picture.half_angle_rad, spread_rad * s) for s in (1, 1 - unsure)) for picture in seen.values()
+    ]
     narrow += [emitter.half_angle_rad for emitter in placed]
     factor = columns_for(columns, narrow) // columns
     fine = finer(environment, factor)
     rgb, moved = fine.rgb().astype(float).reshape(-1, 3), []
-    before, unsure = rgb.copy(), spread_sigma_of(environment)
+    before = rgb.copy()
     for number, emitter in enumerate(emitters):
         texels = np.asarray(emitter.texels, int)
         parts = within(texels, columns, factor)

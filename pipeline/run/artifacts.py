@@ -47,7 +47,13 @@ EXPOSURES = Artifact(
     "per view and frame: file, label and estimated exposure, sigma, clipped fraction",
     type=dict[str, list[dict[str, Any]]],
 )
-PHOTOGRAPHS = Artifact("photographs", "rasters", "developed view: R G B, variance.RGB, mask", RADIANCE_UNIT, ACESCG)
+PHOTOGRAPHS = Artifact(
+    "photographs",
+    "rasters",
+    "developed view: R G B, variance.RGB, mask; of the plate interpolation.RGB",
+    RADIANCE_UNIT,
+    ACESCG,
+)
 
 BALANCE = Artifact(
     "balance", "json", "gains that bring each view to the plate's exposure and colour, covariance", "1",
