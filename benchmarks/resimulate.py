@@ -10,6 +10,7 @@ noise of the board photographs, corners (so lens and pose of its own) and shutte
 `DIAL`, each frame by `FRAME` more. Its cameras are turned by up to a pixel, so that lamps and edges fall otherwise
 on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`). How
 soft its ball views are, which decides how a mosaic samples small lamps and nobody states, is drawn from `BALL_PX`.
+The ball's reflectance is stated off by what the probe stage takes such numbers to be off by.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.camera.rigid import rotation_exp
+from pipeline.probes.ball_surface import GIVEN_SIGMA
 from pipeline.run.cli import say
 from pipeline.run.formats import read_exr, write_bytes
 from pipeline.simulation import capture, shapes
@@ -187,6 +189,13 @@ def turns(scene: SimulatedScene) -> dict[str, np.ndarray]:
     return found
 
 
+def stated_wrongly(scene: SimulatedScene) -> SimulatedScene:
+    """The scene with the ball's reflectance as its owner wrote it down: off by `GIVEN_SIGMA`, all channels alike."""
+    off = np.exp(GIVEN_SIGMA * np.random.default_rng([scene.seed, 9]).standard_normal())
+    told = tuple(min(float(value * off), 0.999) for value in scene.ball.reflectance)
+    return scene.model_copy(update={"ball": scene.ball.model_copy(update={"reflectance": told})})
+
+
 def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """A picture (H, W, C) as the camera sees it when it is turned by ``turn`` (3, 3) in its own frame."""
     from scipy.ndimage import map_coordinates
@@ -250,7 +259,7 @@ def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: P
     (out / "objects").symlink_to((shared / "objects").resolve())
     turned, lens, soft = turns(scene), capture.lens_of(scene.camera), softer_px(scene)
     shoot = Reshoot(scene, out, capture.sensor_of(scene))
-    capture.write_manifests(scene, out)
+    capture.write_manifests(stated_wrongly(scene), out)
     write_poses(scene, out / "capture.toml", turned)
     balls = {name: softened(ball, soft[name]) for name, ball in pictures.balls.items()}
     shots = {**balls, "plate": pictures.plate}

@@ -186,7 +186,7 @@ class Studio:
 def interpolated(plate: Raster) -> np.ndarray:
     """(H, W, 3) squared error of the plate's interpolation: each pixel's own, and none of a region's mean."""
     named = "interpolation.R" in plate.channels
-    return plate.rgb("interpolation") if named else np.zeros((*plate.shape, 3), np.float32)
+    return pixels.INTERPOLATED * plate.rgb("interpolation") if named else np.zeros((*plate.shape, 3), np.float32)
 
 
 def rms(variance: np.ndarray) -> np.ndarray:

@@ -189,10 +189,11 @@ def finding(values: np.ndarray, sigma: float = 0.004, tint: float | None = None)
     return Measured(values, sigma * values, tint, 1000, 20, np.zeros(3))
 
 
-def test_given_stays_when_measured_agrees():
+def test_given_and_measured_are_averaged_when_they_agree():
     surface, warnings = decide(TRUE, None, finding(TRUE * 1.003))
-    assert (surface.facing == TRUE).all()
-    assert surface.source == "given"
+    share = 0.004**-2 / (0.004**-2 + ball_surface.GIVEN_SIGMA**-2)
+    assert surface.facing == pytest.approx(TRUE * (1 + 0.003 * share), rel=1e-4)
+    assert surface.source == "given and measured"
     assert not warnings
     # two independent statements of the same thing
     assert surface.sigma == pytest.approx(1 / np.hypot(1 / 0.004, 1 / ball_surface.GIVEN_SIGMA), rel=0.01)

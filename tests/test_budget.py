@@ -369,7 +369,7 @@ def test_desk_says_how_far_its_pixels_can_be_trusted(desk_build):
     assert np.sqrt(parts) == pytest.approx(sigma, rel=2e-3)
     alone = (layers["influence"] == 0) & (layers["obj.A"] == 0)
     assert alone.any()
-    own = np.sqrt(plate.rgb("variance") + plate.rgb("interpolation"))
+    own = np.sqrt(plate.rgb("variance") + pixels.INTERPOLATED * plate.rgb("interpolation"))
     assert sigma[alone] == pytest.approx(own[alone], rel=2e-3)
     covered = layers["obj.A"] > 0.999
     own = own[covered]

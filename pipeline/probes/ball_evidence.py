@@ -277,7 +277,7 @@ def surface_reasons(surface: Surface, measured: Measured | None, gloss: bool = F
     off = np.abs(surface.facing - measured.facing) + 2 * measured.sigma
     return [
         {
-            "term": "reflectance measured from the plane", "modelled": surface.source == "measured",
+            "term": "reflectance measured from the plane", "modelled": "measured" in surface.source,
             "because": (
                 f"{measured.pairs} pixels of the ball show points of the plane that are seen directly, too: "
                 f"{', '.join(f'{v:.3f} +- {s:.3f}' for v, s in zip(measured.facing, measured.sigma, strict=True))}; "

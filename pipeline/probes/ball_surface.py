@@ -250,9 +250,9 @@ def _climb(data: _Data, tint: np.ndarray | Glass | None) -> tuple[Any, bool, lis
 def decide(given: np.ndarray | None, material: str | None, measured: Measured | None) -> tuple[Surface, list[str]]:
     """The surface that is used, and what to warn of. ``given`` (3,) ACEScg, head on; ``material`` of `conductors`.
 
-    Given numbers stay when the measured ones agree within ``DISAGREE`` sigma, and become surer by them; when not, they
-    stay too, warned about, and as unsure as the two differ. A metal's own numbers count as given. Without any, the
-    measured ones are taken; without those, chrome's, which nobody should rely on.
+    Given numbers and measured ones that agree within ``DISAGREE`` sigma are averaged by their weights; where they do
+    not, the given ones stay, warned about, and as unsure as the two differ. A metal's own numbers count as given.
+    Without any, the measured ones are taken; without those, chrome's, which nobody should rely on.
     """
     tint = None
     source = "given"
@@ -278,7 +278,9 @@ def decide(given: np.ndarray | None, material: str | None, measured: Measured | 
     difference = np.abs(given - measured.facing)
     sigma = np.hypot(measured.sigma, GIVEN_SIGMA * given)
     if (difference < DISAGREE * sigma).all():
-        return Surface(given, 1 / np.hypot(given / measured.sigma, 1 / GIVEN_SIGMA), tint, source), []
+        weights = (GIVEN_SIGMA * given) ** -2.0, measured.sigma**-2.0
+        mean = (weights[0] * given + weights[1] * measured.facing) / (weights[0] + weights[1])
+        return Surface(mean, 1 / (mean * np.sqrt(weights[0] + weights[1])), tint, f"{source} and measured"), []
     text = (
         f"reflectance of the ball: {source} {_text(given)}, measured {_text(measured.facing)} +- "
         f"{_text(measured.sigma)} from the plane seen in it; {source} kept, as unsure as they differ; leave "
