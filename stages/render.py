@@ -36,7 +36,7 @@ from pipeline.transport.placing import clearances, feet, off_plane, place_object
 from pipeline.transport.reflectance import reflected_radiance
 from pipeline.transport.region import BLUR, Window, limits_for
 from pipeline.transport.scene import Worlds, build_worlds
-from pipeline.transport.softened import SOFTNESS, Softness, softened, softness_of
+from pipeline.transport.softened import SOFTNESS, PlateLens, softened, softness_of
 from pipeline.transport.trace import LensRays, Rays
 from pipeline.transport.variant import use_mitsuba
 from pipeline.types import Camera, Emitter, Occluder, Plane, Proxy, Raster, Result, Surface, View
@@ -381,7 +381,7 @@ def evidence(params: knobs.Render, numbers: dict[str, Any]) -> list[dict[str, An
     ]
 
 
-def through_lens(soft: Softness) -> dict[str, Any]:
+def through_lens(soft: PlateLens) -> dict[str, Any]:
     """Why what is rendered is as soft as it is."""
     because = {
         "stated": "knob render.softness_px",

@@ -15,7 +15,7 @@ from pipeline.transport.passes import Halves
 from pipeline.transport.pilot import Effort, Pilot
 from pipeline.transport.region import WHOLE, Region, Window
 from pipeline.transport.scene import Worlds
-from pipeline.transport.softened import Softness
+from pipeline.transport.softened import PlateLens
 from pipeline.transport.trace import LensRays, Rays, Samples, centre_albedo
 
 TRUSTED = 16  # samples of a pixel and half from which noise is judged
@@ -46,7 +46,7 @@ class Canvas:
     effort: Effort
     film: Film | None = None  # where light tracing is worth its cost
     pilot: Pilot | None = None  # what the region was made from
-    softness: Softness | None = None  # of the photograph; None leaves pixels boxes
+    softness: PlateLens | None = None  # of the photograph; None leaves pixels boxes
 
     @functools.cached_property
     def traced(self) -> np.ndarray:

@@ -23,7 +23,7 @@ ELSEWHERE_PX = 0.1  # more sigma of a softness that was measured in another phot
 
 
 @dataclass(frozen=True)
-class Softness:
+class PlateLens:
     """Standard deviation of lens and pixel [px], its sigma, and where it is known from: measured, stated, assumed."""
 
     px: float
@@ -41,19 +41,19 @@ class Softness:
         return 2 * self.px * self.sigma_px
 
 
-def softness_of(views: dict[str, View], stated_px: float | None) -> Softness:
+def softness_of(views: dict[str, View], stated_px: float | None) -> PlateLens:
     """The plate's: as ``stated_px`` says, as measured in the plate, or in the surest other view of its camera."""
     if stated_px is not None:
-        return Softness(stated_px, 0.0, "stated")
+        return PlateLens(stated_px, 0.0, "stated")
     own = views["plate"]
     if own.softness_px is not None:
-        return Softness(own.softness_px, own.softness_sigma_px, "measured")
+        return PlateLens(own.softness_px, own.softness_sigma_px, "measured")
     others = [v for v in views.values() if v.camera is None and v.softness_px is not None]
     if others:
         best = min(others, key=lambda view: view.softness_sigma_px)
         assert best.softness_px is not None
-        return Softness(best.softness_px, float(np.hypot(best.softness_sigma_px, ELSEWHERE_PX)), "measured elsewhere")
-    return Softness(USUAL_PX, USUAL_SIGMA_PX, "assumed")
+        return PlateLens(best.softness_px, float(np.hypot(best.softness_sigma_px, ELSEWHERE_PX)), "measured elsewhere")
+    return PlateLens(USUAL_PX, USUAL_SIGMA_PX, "assumed")
 
 
 def kernel(variance: float) -> np.ndarray:
