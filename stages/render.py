@@ -387,13 +387,13 @@ def through_lens(soft: PlateLens) -> dict[str, Any]:
         "stated": "knob render.softness_px",
         "measured": "the edges of the print in the plate",
         "measured elsewhere": "the edges of the print in another view of its camera",
-        "assumed": "no view shows a print; what lenses and demosaicking usually leave",
+        "assumed": "no view shows a print; as soft as lenses usually are",
     }[soft.source]
     return {
         "term": "the plate's lens on what is rendered",
         "modelled": soft.variance > 0,
         "because": f"{because}: {soft.px:.2f} +- {soft.sigma_px:.2f} px, pixel included",
-        "could_cost": "its sigma, at edges" if soft.variance > 0 else "edges sharper than the photograph's",
+        "could_cost": "its sigma, at edges" if soft.variance > 0 else "nothing: a pixel's own box is as soft",
         **({} if soft.variance > 0 else {"bound_rel": 0.0}),
     }
 

@@ -257,6 +257,7 @@ def pieces_of(edges: Edges, camera: Camera, world_from_camera: np.ndarray) -> Pi
 
     start, along_m = edges.ends[:, 0], edges.ends[:, 1] - edges.ends[:, 0]
     whole_m = np.linalg.norm(along_m, axis=-1)
+    # an end that the lens does not show has no pixel: NaN, length 0, and the edge is not cut into pieces
     whole = np.nan_to_num(np.linalg.norm(pixels(start + along_m) - pixels(start), axis=-1))
     whole = np.minimum(whole, camera.width + camera.height)  # one that ends beside the lens is longer
     of, number, share = _cut(np.where(whole >= SHORTEST_PX, np.ceil(whole / PIECE_PX), 0).astype(int))

@@ -35,11 +35,6 @@ class PlateLens:
         """What the lens adds to the pixel's box [px^2]."""
         return max(self.px**2 - BOX_PX2, 0.0)
 
-    @property
-    def variance_sigma(self) -> float:
-        """Standard uncertainty of `variance` [px^2]."""
-        return 2 * self.px * self.sigma_px
-
 
 def softness_of(views: dict[str, View], stated_px: float | None) -> PlateLens:
     """The plate's: as ``stated_px`` says, as measured in the plate, or in the surest other view of its camera."""
