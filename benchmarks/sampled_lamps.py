@@ -2,12 +2,13 @@
 
     .venv/bin/python -m benchmarks.sampled_lamps [SEEDS] [--folder build/sampled]
 
-The laws of `pipeline.light.alike` (`sampled`, `sampled_behind`, `point_px`). Lamps of 0.5 to 6 degrees in balls of 45
+The laws of `pipeline.light.alike` (`AS_SEEN`, `RESTORED`, `point_px`). Lamps of 0.5 to 6 degrees in balls of 45
 to 130 px, under lenses of `SOFT` px (with the pixel, standard deviation of a Gaussian), through RGGB mosaics of four
-cameras, bilinear, unwrapped by the probe's own code to maps of 512 and 1024 columns. Of each lamp, the light in the
-texels that `pipeline.light.emitters.lights` finds is compared with the truth, and the second moments of what they show
-with those of the lamp's disc. No photon noise, no error of pose or fit. Constants of the light are fitted to even
-seeds, its tables are of odd ones. Six seeds: ten minutes of one core.
+cameras, bilinear, as they are and without small lights' aliases (`pipeline.image.small_lights`), unwrapped by the
+probe's own code to maps of 512 and 1024 columns. Of each lamp, the light in the texels that
+`pipeline.light.emitters.lights` finds is compared with the truth, and the second moments of what they show with those
+of the lamp's disc. No photon noise, no error of pose or fit. Constants of the light are fitted to even seeds, its
+tables are of odd ones. Six seeds: twenty minutes of one core.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 
 from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.image.demosaic import demosaic
+from pipeline.image.small_lights import restored
 from pipeline.light import alike
 from pipeline.light.emitters import Patch, lights
 from pipeline.light.narrowing import above_least
@@ -53,7 +55,7 @@ MATRICES = np.array(
 SMALLEST, LEAST = 0.8, 6.0  # px of a lamp that counts, and that it covers: finer than `SPLIT` shows is none
 RESOLVED_PX = 45.0  # lamps of more px keep nine tenths of their width, and lose some of their border with the patch
 # Of Student's likelihood: those of 4, 8, 16, 32 with intervals of 50, 68 and 95 % nearest to it.
-UNKNOWN_FREEDOM, KNOWN_FREEDOM = 8.0, 32.0
+UNKNOWN_FREEDOM, KNOWN_FREEDOM, RESTORED_FREEDOM = 8.0, 32.0, 8.0
 AREAS = (0.8, 1.5, 3, 6, 12, 20, 45, 90, 200)  # px of lamps, for tables
 
 
@@ -128,18 +130,26 @@ def shot(radius_px: float, half: float, seed: int) -> Shot:
     return Shot(photograph(place, camera, pose, SPLIT), camera, view, ball, lamps, radiance)
 
 
-def through_mosaic(picture: np.ndarray, matrix: np.ndarray) -> Raster:
-    """A photograph of ``picture`` (h, w, 3), ACEScg, by an RGGB mosaic whose camera has ``matrix`` (3, 3) from XYZ."""
+def through_mosaic(picture: np.ndarray, matrix: np.ndarray, better: bool) -> Raster | None:
+    """A photograph of ``picture`` (h, w, 3), ACEScg, by an RGGB mosaic whose camera has ``matrix`` (3, 3) from XYZ.
+
+    ``better``: without small lights' aliases; then None where some light kept them.
+    """
     camera_rgb = camera_from_acescg(matrix)
     camera_rgb = camera_rgb / camera_rgb.sum(1, keepdims=True)
     row, column = np.mgrid[: len(picture), : picture.shape[1]] % 2
     mosaic = np.take_along_axis(picture @ camera_rgb.T, (row + column)[..., None], -1)[..., 0].astype(np.float32)
-    rgb = (demosaic(mosaic, "RGGB", "bilinear") @ np.linalg.inv(camera_rgb).T).astype(np.float32)
+    seen = demosaic(mosaic, "RGGB", "bilinear")
+    if better:
+        seen, lights = restored(seen, mosaic, "RGGB", np.zeros(mosaic.shape, bool))
+        if lights.left:
+            return None
+    rgb = (seen @ np.linalg.inv(camera_rgb).T).astype(np.float32)
     layers = {**Raster.split(rgb), **Raster.split(1e-5 * np.abs(rgb), "variance")}
     return Raster({**layers, "mask": np.zeros(rgb.shape[:2], np.uint32)}, "acescg")
 
 
-def rows_of(radius_px: float, half: float, seed: int, width: int) -> list[list[float]]:
+def rows_of(radius_px: float, half: float, seed: int, width: int, better: bool) -> list[list[float]]:
     """Of every lamp that is told apart behind every lens of `SOFT`: what `Measured` holds, in its order."""
     from scipy.ndimage import gaussian_filter
 
@@ -148,7 +158,9 @@ def rows_of(radius_px: float, half: float, seed: int, width: int) -> list[list[f
     for number, soft_px in enumerate(SOFT):
         lens, colour = np.sqrt(soft_px**2 - 1 / 12), tint(random.uniform(2500, 6500))
         picture = gaussian_filter(one.picture, (lens, lens, 0)) * colour
-        taken = through_mosaic(picture, MATRICES[(seed + number) % len(MATRICES)])
+        taken = through_mosaic(picture, MATRICES[(seed + number) % len(MATRICES)], better)
+        if taken is None:
+            continue
         seen = view_map(taken, one.camera, one.view, one.ball, RADIUS, surface, Grid(width))
         patches = lights(seen.rgb, 0.001, np.radians(14))[0]
         for direction in one.lamps:
@@ -179,12 +191,13 @@ def of_lamp(
     return [area, covered, *(patch.irradiance / true - 1), wider, np.pi / shape[0] / pixel]
 
 
-def simulated(seed: int, kept: Path) -> np.ndarray:
-    """Rows (N, 8) of one seed, read from ``kept`` or simulated and written there."""
+def simulated(seed: int, folder: Path, better: bool) -> np.ndarray:
+    """Rows (N, 8) of one seed, read from ``folder`` or simulated and written there."""
+    kept = folder / f"{'restored' if better else 'as_seen'}_{seed}.npy"
     if not kept.exists():
         cases = [(radius, np.radians(half)) for radius in RADII for half in HALF_DEG]
         width = WIDTHS[seed // 2 % 2]
-        rows = [row for n, case in enumerate(cases) for row in rows_of(*case, seed * len(cases) + n, width)]
+        rows = [row for n, case in enumerate(cases) for row in rows_of(*case, seed * len(cases) + n, width, better)]
         np.save(kept, np.array(rows))
     return np.asarray(np.load(kept))
 
@@ -215,7 +228,7 @@ def likeliest(
 
 
 def fitted_unknown(found: Measured) -> np.ndarray:
-    """POINT, FADES, SPREAD of `alike.sampled`."""
+    """``point, fades, spread`` of `alike.Sampling`."""
 
     def law(p: np.ndarray) -> np.ndarray:
         return np.asarray(np.hypot(p[0] * np.exp(-found.covered / p[1]), p[2] * found.covered**-0.75))
@@ -223,15 +236,17 @@ def fitted_unknown(found: Measured) -> np.ndarray:
     return likeliest(law, [5, 3, 0.5], found.error[:, [0, 2]], UNKNOWN_FREEDOM)
 
 
-def fitted_known(found: Measured) -> np.ndarray:
-    """TOP, BORDER of `alike.sampled_behind`."""
+def fitted_known(found: Measured, better: bool) -> np.ndarray:
+    """``top, border`` of `alike.Sampling`, the powers being a disc's; ``better``: also ``knee, falls, ends``."""
     fades, point = np.exp(-((np.pi * found.soft_px) ** 2) / 2), points_of(found)
 
     def law(p: np.ndarray) -> np.ndarray:
         own = np.maximum(found.covered - 4 * np.pi * point**2, 0)
-        return np.asarray(np.hypot(p[0] * fades * (1 + own) ** -0.75, p[1] * point * found.covered**-0.5))
+        knee, falls, ends = p[2:] if better else (1.0, 0.75, 0.5)
+        return np.asarray(np.hypot(p[0] * fades * (1 + own / knee) ** -falls, p[1] * point * found.covered**-ends))
 
-    return likeliest(law, [2, 0.07], found.error[:, [0, 2]], KNOWN_FREEDOM)
+    start = [1, 0.06, 1, 0.75, 0.5] if better else [2, 0.07]
+    return likeliest(law, start, found.error[:, [0, 2]], RESTORED_FREEDOM if better else KNOWN_FREEDOM)
 
 
 def points_of(found: Measured) -> np.ndarray:
@@ -239,12 +254,12 @@ def points_of(found: Measured) -> np.ndarray:
     return np.asarray(np.sqrt(found.soft_px**2 + alike.ADDED_PX2 + found.texel**2 / 6))
 
 
-def sigmas(found: Measured, known: bool) -> np.ndarray:
+def sigmas(found: Measured, known: bool, law: alike.Sampling) -> np.ndarray:
     """(N, 3) stated sigma, with or without the softness."""
     if not known:
-        return np.stack([alike.sampled(covered) for covered in found.covered])
+        return np.stack([alike.sampled(covered, law) for covered in found.covered])
     columns = zip(found.covered, found.soft_px, points_of(found), strict=True)
-    return np.stack([alike.sampled_behind(*lamp) for lamp in columns])
+    return np.stack([alike.sampled_behind(*lamp, law) for lamp in columns])
 
 
 def groups(found: Measured) -> list[tuple[str, np.ndarray]]:
@@ -254,9 +269,9 @@ def groups(found: Measured) -> list[tuple[str, np.ndarray]]:
     return [(name, some) for name, some in [*by_lens, *by_area, ("all", found.area > 0)] if some.any()]
 
 
-def light_table(found: Measured, known: bool) -> list[str]:
+def light_table(found: Measured, known: bool, law: alike.Sampling) -> list[str]:
     """Rows: errors' rms in per cent, over sigma, and the share that intervals of 50, 68 and 95 % hold."""
-    z, lines = found.error / sigmas(found, known), []
+    z, lines = found.error / sigmas(found, known, law), []
     for name, some in groups(found):
         rms, over = 100 * np.sqrt((found.error[some] ** 2).mean(0)), np.sqrt((z[some] ** 2).mean(0))
         inside = [(np.abs(z[some]) < q).mean() for q in (0.674, 1, 1.96)]
@@ -279,6 +294,27 @@ def spread_table(found: Measured) -> list[str]:
     return lines
 
 
+def told(rows: list[np.ndarray], better: bool) -> None:
+    """Say the tables and constants of the pictures as they are, or of those without small lights' aliases."""
+    law = alike.RESTORED if better else alike.AS_SEEN
+    found = read(rows)
+    even, odd = found.where(~found.odd), found.where(found.odd)
+    of_law = even.where((even.soft_px >= UNKNOWN[0]) & (even.soft_px <= UNKNOWN[1]))
+    known, unknown = fitted_known(even, better), fitted_unknown(of_law)
+    small = found.where(found.area < RESOLVED_PX)
+    added = small.wider - small.soft_px**2 - small.texel**2 / 6
+    relative = np.sqrt(np.maximum(small.wider, 0)) / points_of(small)
+    say("without small lights' aliases" if better else "as seen")
+    say("light, softness known\n" + "\n".join(light_table(odd, True, law)))
+    say("light, softness unknown\n" + "\n".join(light_table(odd, False, law)))
+    say("width of a point\n" + "\n".join(spread_table(small)))
+    say(f"fit, known: top, border (knee, falls, ends) {np.round(known, 3)}")
+    say("fit, unknown: point {:.2f}, fades {:.2f}, spread {:.2f}".format(*unknown))
+    say(f"ADDED_PX2 {added.mean():.3f}; scatter of one lamp's spread {relative.std():.3f}")
+    green = [np.median(np.abs(even.error[:, channels])) for channels in ([1], [0, 2])]
+    say(f"green over red and blue, medians {green[0] / green[1]:.2f} ({law.green})\n")
+
+
 def main() -> None:
     """Simulate what is missing, print."""
     parser = argparse.ArgumentParser(prog="benchmarks.sampled_lamps")
@@ -286,21 +322,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("build/sampled"))
     asked = parser.parse_args()
     asked.folder.mkdir(parents=True, exist_ok=True)
-    found = read([simulated(seed, asked.folder / f"seed_{seed}.npy") for seed in range(asked.seeds)])
-    even, odd = found.where(~found.odd), found.where(found.odd)
-    of_law = even.where((even.soft_px >= UNKNOWN[0]) & (even.soft_px <= UNKNOWN[1]))
-    known, unknown = fitted_known(even), fitted_unknown(of_law)
-    small = found.where(found.area < RESOLVED_PX)
-    added = small.wider - small.soft_px**2 - small.texel**2 / 6
-    relative = np.sqrt(np.maximum(small.wider, 0)) / points_of(small)
-    say("light, softness known\n" + "\n".join(light_table(odd, True)))
-    say("light, softness unknown\n" + "\n".join(light_table(odd, False)))
-    say("width of a point\n" + "\n".join(spread_table(small)))
-    say("fit, known: TOP {:.2f}, BORDER {:.3f}".format(*known))
-    say("fit, unknown: POINT {:.2f}, FADES {:.2f}, SPREAD {:.2f}".format(*unknown))
-    say(f"ADDED_PX2 {added.mean():.3f}; scatter of one lamp's spread {relative.std():.3f}")
-    green = np.sqrt((even.error[:, 1] ** 2).mean() / (even.error[:, [0, 2]] ** 2).mean())
-    say(f"green over red and blue {green:.2f} ({alike.GREEN})")
+    for better in (False, True):
+        told([simulated(seed, asked.folder, better) for seed in range(asked.seeds)], better)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ the matrix where that is asked for. Data without a mosaic come from the space th
 model use one profile; another model has its own matrices, and its neutral is how it would see the plate's white:
 however either was set, plate and ball agree. Variances go through squared kernels and squared matrix.
 
+Lights a few photosites wide in views of a ball lose what photosites make of them (`pipeline.image.small_lights`).
 What interpolation errs besides the noise, which it exceeds at edges, is no part of the variance, as it hides nothing:
 the plate has it apart (``interpolation.RGB``), for the uncertainty of its pixels.
 
@@ -25,13 +26,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.conventions import ACESCG, CAMERA_RGB, CHART_VIEW, CLIPPED, FLAT_VIEW
+from pipeline.conventions import ACESCG, CAMERA_RGB, CHART_VIEW, CLIPPED, FLAT_VIEW, GHOST
 from pipeline.image import colour, sensitivities
 from pipeline.image.charted import read_chart, with_chart
-from pipeline.image.demosaic import METHOD, Method, balance_gains, balanced_rgb, interpolation_variance
+from pipeline.image.demosaic import METHOD, Method, balance_gains, balanced_rgb, demosaic, interpolation_variance
+from pipeline.image.small_lights import RESTORED, SmallLights, restored
 from pipeline.image.vignetting import Losses
 from pipeline.run.artifacts import FACTS, MOSAICS, PHOTOGRAPHS
 from pipeline.run.errors import ArtifactError
+from pipeline.run.evidence import ABSENT
 from pipeline.run.stage import Stage
 from pipeline.types import Raster, Result
 from stages import knobs
@@ -61,13 +64,23 @@ def compute(facts: dict[str, Any], mosaics: dict[str, Raster], params: knobs.Dev
         warnings += charted.warnings
     profiles = one_white(profiles)
 
+    balls = {ball["name"] for ball in facts.get("ball", [])}
+    small: dict[str, SmallLights] = {}
+
     def one(view: str) -> Raster:
         mosaic = losses.corrected(mosaics[view], profiles[view])
-        return develop(mosaic, profiles[view], method_of(view, params.demosaic), view)
+        photograph = develop(mosaic, profiles[view], method_of(view, params.demosaic), view)
+        if view in balls and mosaic.attributes["insitu:cfa"]:
+            photograph, small[view] = without_aliases(photograph, mosaic, acescg_of(profiles[view], view))
+        return photograph
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         photographs = dict(zip(views, pool.map(one, views)))
     numbers |= {"views": {view: _numbers(raster) for view, raster in photographs.items()}, **losses.numbers}
+    for view, lights in small.items():
+        numbers["views"][view]["small_lights"] = len(lights.fitted)
+        numbers["views"][view]["largest_alias_rel"] = lights.largest_alias
+    evidence += [_small_lights(dict(sorted(small.items())))] * bool(small)
     shown_in = "plate" if "plate" in views else views[0]
     if mosaics[shown_in].attributes["insitu:cfa"]:
         numbers["interpolation"] = edge_error(mosaics[shown_in], acescg_of(profiles[shown_in], shown_in))
@@ -141,6 +154,40 @@ def _interpolation(view: str, numbers: dict[str, float]) -> dict[str, Any]:
     }
 
 
+def without_aliases(
+    photograph: Raster, mosaic: Raster, acescg_from_camera: np.ndarray
+) -> tuple[Raster, SmallLights]:  # fmt: skip
+    """A ball's bilinear photograph without its small lights' aliases, which its header says; and those lights."""
+    neutral, cfa = np.linalg.solve(acescg_from_camera, np.ones(3)), str(mosaic.attributes["insitu:cfa"])
+    values = mosaic["Y"] * balance_gains(neutral, cfa, mosaic.shape)
+    plain = demosaic(values, cfa, "bilinear")
+    unusable = photograph["mask"] & (CLIPPED | GHOST) > 0
+    better, lights = restored(plain, values, cfa, unusable)
+    change = colour.apply_matrix(acescg_from_camera * neutral, better - plain)
+    channels = photograph.channels | Raster.split(photograph.rgb() + change)
+    told = photograph.attributes | {RESTORED: str(int(lights.left == 0))}
+    return Raster(channels, photograph.space, told), lights
+
+
+def _small_lights(small: dict[str, SmallLights]) -> dict[str, Any]:
+    """Whether balls mirror lights that their photosites sample too coarsely."""
+    told = [f"{view} {len(one.fitted)}, by up to {one.largest_alias:.1%}" for view, one in small.items() if one.fitted]
+    left = [f"{view} {one.left}" for view, one in small.items() if one.left]
+    because = f"lights a few photosites wide, whose colours they misstate: {'; '.join(told)}" if told else ""
+    if left:
+        because += f"{'; ' if told else ''}left as they are, clipped or no ellipses: {', '.join(left)}"
+    done: dict[str, Any] = {} if told and not left else ABSENT
+    if left:
+        done = {"no_bound": "it is in the sigma of the lamps' flux"}
+    return {
+        "term": "aliases of small lights",
+        "modelled": bool(told) if not (told and left) else "in part",
+        "because": because or f"{' and '.join(small)} show no light that is small and stands alone",
+        "could_cost": "light and colour of lamps that are a few photosites wide",
+        **done,
+    }
+
+
 def _of_profile(profile: dict[str, Any]) -> list[dict[str, Any]]:
     """What a camera's colours rest on."""
     if profile["space"] != CAMERA_RGB:
@@ -154,8 +201,9 @@ def method_of(view: str, asked: Method) -> Method:
     """The method for a view: a ball is always interpolated bilinearly, whatever the plate gets.
 
     Sharper methods borrow from the other channels, which tints a lamp a few photosites wide; bilinear kernels keep each
-    channel's sum. Irradiance of the desk capture over 200 upward normals against truth, root mean square of R, G, B:
-    bilinear 0.5, 0.7, 1.0 %; Malvar 0.6, 0.9, 1.2 %; Menon moved red by up to 5 %.
+    channel's sum, from which `small_lights` then takes what photosites made of it. Irradiance of the desk capture over
+    200 upward normals against truth, root mean square of R, G, B, without that: bilinear 0.5, 0.7, 1.0 %; Malvar 0.6,
+    0.9, 1.2 %; Menon moved red by up to 5 %.
     """
     return asked if view == "plate" else "bilinear"
 

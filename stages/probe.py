@@ -93,7 +93,7 @@ def compute(
         ACESCG,
         {"insitu:unit": RADIANCE_UNIT, "insitu:frame": "world", "envmap": "latlong"}
         | {SCALE_SIGMA: " ".join(f"{sigma:.6g}" for sigma in np.broadcast_to(shared, 3))}
-        | combine.picture_header(merged, maps, views)
+        | combine.picture_header(merged, maps, views, photographs)
         | near_field.places(centre if near.target is None else near.target, centre)
         | ({} if near.target is not None or observed.smooth_only else header_of(lamps.placed)),
     )

@@ -9,6 +9,7 @@ import pytest
 from mirror_scene import Lamp, Place, look_at, photograph, sky
 
 from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
+from pipeline.image import small_lights
 from pipeline.image.demosaic import ADDED_PX2, Method, demosaic, demosaic_variance
 from pipeline.light import alike
 from pipeline.light.emitters import lights
@@ -237,13 +238,16 @@ def test_the_header_says_how_large_and_how_soft_the_pictures_are():
     view = ViewMap(np.ones((32, 64, 3)), 0.01 * np.ones((32, 64, 3)), even, even, quality=quality)
     merged = combine.merge([view, view])
     maps = {"near": view, "far": view}
-    header = combine.picture_header(merged, maps, {"near": seen_from(1.0), "far": seen_from(0.9)})
+    seen = Raster(Raster.split(view.rgb), "acescg")
+    pictures = {"near": Raster(seen.channels, "acescg", {small_lights.RESTORED: "1"}), "far": seen}
+    header = combine.picture_header(merged, maps, {"near": seen_from(1.0), "far": seen_from(0.9)}, pictures)
+    assert header[alike.ALIASED] == "0 1"  # what does not say that it was restored was not
     assert float(header[alike.ALIKE]) == pytest.approx(alike.ALIKE_PX * 180 / 32, rel=1e-3)
     assert float(header[alike.ALIKE_VIEWS]) == pytest.approx(2.0)
     told = alike.softness_of(Raster(Raster.split(view.rgb), "acescg", header))
     assert told == pytest.approx(np.array([1.0, 0.9]), rel=1e-3)
     for other in ({"far": seen_from(None)}, {}):
-        assert alike.SOFT not in combine.picture_header(merged, maps, {"near": seen_from(1.0), **other})
+        assert alike.SOFT not in combine.picture_header(merged, maps, {"near": seen_from(1.0), **other}, pictures)
 
 
 def test_softness_is_known_when_that_of_every_view_is():
@@ -341,3 +345,21 @@ def test_each_view_samples_by_its_own_lens():
     assert alike.sampling_sigma(map_of(rgb, 0.0, header), light) == pytest.approx(
         alike.sampled(20.0) / np.sqrt(2), rel=1e-3
     )
+
+
+def test_a_view_that_lost_its_aliases_is_surer():
+    """By its own law, beside one that kept them; without softness too."""
+    rgb, texels = square_lamp()
+    alone = np.zeros_like(rgb)
+    alone.reshape(-1, 3)[texels] = 1.0
+    light = latlong_solid_angles(256, 512)[..., None] * alone
+    pixel = float(np.degrees(np.sqrt(light[..., 0].sum() / 20)))
+    header = {alike.ALIKE: repr(alike.ALIKE_PX * pixel), alike.ALIKE_VIEWS: "2", alike.ALIASED: "0 1"}
+    each = [alike.sampled(20.0, law) for law in (alike.RESTORED, alike.AS_SEEN)]
+    assert (each[0] < 0.7 * each[1]).all()
+    assert alike.sampling_sigma(map_of(rgb, 0.0, header), light) == pytest.approx(np.hypot(*each) / 2, rel=1e-3)
+    told = map_of(rgb, 0.0, {**header, alike.SOFT: "0.6 0.8"})
+    point = alike.point_px(told, np.hypot(0.6, 0.8) / np.sqrt(2))
+    laws = zip((0.6, 0.8), (alike.RESTORED, alike.AS_SEEN), strict=True)
+    each = [alike.sampled_behind(20.0, soft, point, law) for soft, law in laws]
+    assert alike.sampling_sigma(told, light) == pytest.approx(np.hypot(*each) / 2, rel=1e-3)

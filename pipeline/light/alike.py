@@ -12,6 +12,8 @@ sum takes the variance that was not raised.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pipeline.conventions import latlong_directions, latlong_solid_angles
@@ -24,14 +26,34 @@ SOFT = "insitu:soft_px"  # in a map's header: softness of each of its views, len
 ALIKE_PX = 3.0  # pixels of the probe's picture: demosaicking takes in two to each side
 ALIKE_DEG = 2.8  # of a map that does not say: as wide as the cells of `pipeline.probes.combine`
 RAISED = "raised"  # of a map: what texels' variances were multiplied by because views differ, 1 where not
-# Relative error of a lamp's light by the n pixels that it covers: (POINT exp(-n / FADES), SPREAD n^(-3/4)), squares
-# added, of red and blue, each a quarter of an RGGB mosaic; of green, half of it, a `GREEN` of that. See `sampled`.
-POINT, FADES, SPREAD, GREEN = 3.0, 4.2, 0.32, 0.4
-# The same of a picture whose softness b is known: (TOP exp(-pi^2 b^2 / 2) (1 + a)^(-3/4), BORDER s n^(-1/2)), of a
-# lamp's own a = n - 4 pi s^2 pixels, where s [px] is what a point becomes. See `sampled_behind`.
-TOP, BORDER = 1.75, 0.06
+ALIASED = "insitu:aliased"  # in a map's header: of each of its views, 1 where small lights keep their aliases
 ADDED_PX2 = 0.72  # variance [px^2] along an axis that demosaicking and looking up add to lens and pixel
 HARDLY = 0.1  # of the brightest channel: no lamp that glows has so little green in ACEScg, only red and blue diodes
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Relative error of a lamp's light by how a mosaic samples it; of red and blue, a quarter of an RGGB mosaic each.
+
+    Of a lens of b px that is known: ``(top exp(-pi^2 b^2 / 2) (1 + a / knee)^-falls, border s n^-ends)``, squares
+    added, of n pixels that the lamp covers, a = n - 4 pi s^2 of its own, where s [px] is what a point becomes. Of a
+    lens that is not known: ``(point exp(-n / fades), spread n^(-3/4))``. Of green ``green`` of either.
+    """
+
+    top: float
+    knee: float
+    falls: float
+    border: float
+    ends: float
+    point: float
+    fades: float
+    spread: float
+    green: float
+
+
+# Of bilinear pictures as they are, and of those whose small lights lost their aliases (`pipeline.image.small_lights`).
+AS_SEEN = Sampling(1.75, 1.0, 0.75, 0.06, 0.5, 3.0, 4.2, 0.32, 0.4)
+RESTORED = Sampling(0.76, 0.88, 1.05, 0.027, 0.28, 2.2, 3.5, 0.21, 0.47)
 
 
 def alike_rows(environment: Raster) -> int:
@@ -70,7 +92,7 @@ def cell_sums(values: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate(sums)
 
 
-def sampled(pixels: float) -> np.ndarray:
+def sampled(pixels: float, law: Sampling = AS_SEEN) -> np.ndarray:
     """Relative sigma (3,) of the light of a lamp that a mosaic's bilinear picture shows ``pixels`` pixels large.
 
     Bilinear kernels keep each colour's sum, so a colour's light is a sum over its own photosites, which by Poisson's
@@ -80,37 +102,44 @@ def sampled(pixels: float) -> np.ndarray:
     falls with the exponential of the area; the edge of a larger disc has (area)^(-3/4) of that.
     Of pictures whose softness is not known (else `sampled_behind`): b evenly from 0.55 to 0.85 px (half the contrast is
     left at 0.34 to 0.22 cycles per px). A lamp errs three times as much behind the sharpest of these lenses as behind
-    the softest, so errors have heavier tails than normal, and the constants are of largest Student's likelihood: over
-    all lenses intervals of 50, 68 and 95 % hold 55, 72 and 92 % of lamps they were not fitted to; behind the sharpest
-    alone 36, 48 and 77. See `benchmarks.sampled_lamps`.
+    the softest, so errors have heavier tails than normal, and the constants are of largest Student's likelihood.
+    See `benchmarks.sampled_lamps`.
     """
-    return _of_channels(float(np.hypot(POINT * np.exp(-pixels / FADES), SPREAD * pixels**-0.75)))
+    return _of_channels(float(np.hypot(law.point * np.exp(-pixels / law.fades), law.spread * pixels**-0.75)), law)
 
 
-def sampled_behind(pixels: float, soft_px: float, point_px: float) -> np.ndarray:
+def sampled_behind(pixels: float, soft_px: float, point_px: float, law: Sampling = AS_SEEN) -> np.ndarray:
     """As `sampled`, of a picture whose lens and pixel are ``soft_px`` together, and where a point becomes ``point_px``.
 
     Then how many pixels the lamp has for itself is known: a point covers 4 pi s^2 of them, s = ``point_px``, and areas
-    add. What ends a patch leaves some of the lamp's slope out: BORDER. At each of five softnesses intervals of 50, 68
-    and 95 % hold 45 to 56, 66 to 72 and 94 to 97 % of lamps that no constant was fitted to. Limit: a lens is taken for
-    a Gaussian; the simulator's, of three taps, leaves 1.6 times as much at the photosites' frequency.
+    add. What ends a patch leaves some of the lamp's slope out: the second term. Limit: a lens is taken for a Gaussian;
+    the benchmark's and the simulator's, which act on whole pixels, leave 1.6 to 1.9 times as much at the photosites'
+    frequency, for which the constants allow: behind a real lens lamps err by about half of it.
     """
     own = max(pixels - 4 * np.pi * point_px**2, 0.0)
-    return _of_channels(float(np.hypot(by_photosites(own, soft_px), BORDER * point_px * pixels**-0.5)))
+    ends = law.border * point_px * pixels**-law.ends
+    return _of_channels(float(np.hypot(by_photosites(own, soft_px, law), ends)), law)
 
 
-def by_photosites(own_px: float, soft_px: float) -> float:
+def by_photosites(own_px: float, soft_px: float, law: Sampling = AS_SEEN) -> float:
     """Relative sigma of the light of a disc of ``own_px`` by a quarter of the photosites, by the formula of `sampled`.
 
     A point has exp(-2 pi^2 b^2 / 4) of its light at their frequency, b = ``soft_px``; a disc of a px has 2 J_1(x) / x
-    of that, x = sqrt(pi a), whose ripples end as a^(-3/4).
+    of that, x = sqrt(pi a), whose ripples end as a^(-3/4), as those of pictures as they are do.
     """
-    return float(TOP * np.exp(-((np.pi * soft_px) ** 2) / 2) * (1 + own_px) ** -0.75)
+    return float(law.top * np.exp(-((np.pi * soft_px) ** 2) / 2) * (1 + own_px / law.knee) ** -law.falls)
 
 
-def _of_channels(of_quarter: float) -> np.ndarray:
+def _of_channels(of_quarter: float, law: Sampling) -> np.ndarray:
     """Relative sigma (3,) by that of a colour which a quarter of the photosites see; no light errs by more than all."""
-    return np.asarray(np.minimum(of_quarter * np.array([1, GREEN, 1]), 1))
+    return np.asarray(np.minimum(of_quarter * np.array([1, law.green, 1]), 1))
+
+
+def laws_of(environment: Raster) -> list[Sampling]:
+    """The law of each of a map's views; one, of pictures as they are, for a map that does not say."""
+    return [
+        AS_SEEN if aliased == "1" else RESTORED for aliased in str(environment.attributes.get(ALIASED, "1")).split()
+    ]
 
 
 def softness_of(environment: Raster) -> np.ndarray | None:
@@ -153,11 +182,13 @@ def sampling_sigma(environment: Raster, light: np.ndarray) -> np.ndarray:
     squares = float((np.square(shape) / solid).sum())
     covered = float(shape.sum()) ** 2 / squares if squares > 0 else 0.0
     pixels, views = max(covered / pixel, 1.0), views_of(environment)
-    soft = softness_of(environment)
+    soft, laws = softness_of(environment), laws_of(environment)
     if soft is None:
-        return sampled(pixels) / np.sqrt(views)
-    point = point_px(environment, float(np.sqrt(np.mean(soft**2))))  # the map is the mean of its views
-    each = [sampled_behind(pixels, one, point) for one in soft]
+        each = [sampled(pixels, law) for law in laws]
+    else:
+        point = point_px(environment, float(np.sqrt(np.mean(soft**2))))  # the map is the mean of its views
+        laws = laws if len(laws) == len(soft) else [AS_SEEN] * len(soft)
+        each = [sampled_behind(pixels, one, point, law) for one, law in zip(soft, laws, strict=True)]
     return np.asarray(np.sqrt(np.mean(np.square(each), 0) / views))
 
 

@@ -12,13 +12,14 @@ import numpy as np
 
 from pipeline.camera.lens import project
 from pipeline.conventions import direction_from_latlong, invert_rigid, latlong_solid_angles, transform_points
-from pipeline.light.alike import ALIKE, ALIKE_PX, ALIKE_VIEWS, SOFT
+from pipeline.image.small_lights import RESTORED
+from pipeline.light.alike import ALIASED, ALIKE, ALIKE_PX, ALIKE_VIEWS, SOFT
 from pipeline.light.environment import resize_environment
 from pipeline.light.sampling import bilinear, planes
 from pipeline.probes.filling import enlarge
 from pipeline.probes.levelling import precision
 from pipeline.probes.observation import Quality, ViewMap
-from pipeline.types import Camera, View
+from pipeline.types import Camera, Raster, View
 
 WEIGHT_ROWS = 64  # rows of the grid on which views are weighed: cells of 2.8 degrees, wider than views are displaced
 LEAST_SHARE = 0.05  # of the weight: a view that has less was set aside, and does not contradict
@@ -96,7 +97,9 @@ def equal_views(merged: Merged) -> str:
     return f"{float(light.sum()) / squares if squares > 0 else 1.0:.4g}"
 
 
-def picture_header(merged: Merged, maps: dict[str, ViewMap], views: dict[str, View]) -> dict[str, str]:
+def picture_header(
+    merged: Merged, maps: dict[str, ViewMap], views: dict[str, View], photographs: dict[str, Raster]
+) -> dict[str, str]:
     """What a map's header says of the pictures it is from, ``maps`` by view; ``views`` may lack one that is no picture.
 
     Nothing when no map says how large its pixels are; no softness when that of one view is not known.
@@ -106,7 +109,13 @@ def picture_header(merged: Merged, maps: dict[str, ViewMap], views: dict[str, Vi
     if degrees is None:
         return {}
     told = {} if soft is None else {SOFT: " ".join(f"{one:.4g}" for one in soft)}
+    aliased = [int(name not in photographs or not _is_restored(photographs[name])) for name in maps]
+    told[ALIASED] = " ".join(map(str, aliased))
     return {ALIKE: f"{degrees:.4g}", ALIKE_VIEWS: equal_views(merged), **told}
+
+
+def _is_restored(photograph: Raster) -> bool:
+    return photograph.attributes.get(RESTORED) == "1"
 
 
 def soft_px(measured: list[float | None]) -> np.ndarray | None:
