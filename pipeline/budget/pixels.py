@@ -24,7 +24,7 @@ PLATE_PX = 5.0
 TYPICAL = 0.5
 # Of the squared disagreement of two interpolations, what the plate's own errs: pixels that show only the plate, of desk
 # and courtyard at 512 px, bilinear, then hold 51, 66 and 89, and 56, 71 and 93 %; without it 30, 42, 68 and 27, 38, 61.
-INTERPOLATED = 0.75
+INTERPOLATED = 0.6
 SHADOW = 0.05  # relative change of the plate that is called a shadow, as `evaluate` has it
 COVERED = 0.999
 

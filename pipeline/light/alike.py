@@ -53,7 +53,7 @@ class Sampling:
 
 # Of bilinear pictures as they are, and of those whose small lights lost their aliases (`pipeline.image.small_lights`).
 AS_SEEN = Sampling(1.75, 1.0, 0.75, 0.06, 0.5, 3.0, 4.2, 0.32, 0.4)
-RESTORED = Sampling(0.76, 0.88, 1.05, 0.027, 0.28, 2.2, 3.5, 0.21, 0.47)
+RESTORED = Sampling(0.72, 1.13, 1.2, 0.067, 0.54, 1.9, 3.7, 0.18, 0.5)
 
 
 def alike_rows(environment: Raster) -> int:

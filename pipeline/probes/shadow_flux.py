@@ -32,7 +32,7 @@ DIRECTION_SIGMA = np.radians(0.25)  # of a clipped lamp's centroid
 # desk's three lamps and the bundled courtyard's sun, times their shares of that light, were off by 0.007 (rms); of the
 # courtyard photographed 24 times at 512 px by 0.012: at the ball's foot camera and photographer hide 0.5 to 1.6 % more
 # of the sky than from its centre.
-SHADOW_SIGMA = 0.012
+SHADOW_SIGMA = 0.010
 REFLECTANCE_SIGMA = 0.02  # of the ball, for what it mirrors to the plane
 SHADED = 3.0  # sigma below what lamps must at least give it: a card that something shades
 DARKER, PATCH = 0.05, 25  # a patch of so many blocks this much darker than predicted: a lamp that the map lacks
