@@ -31,7 +31,8 @@ DIRECTION_SIGMA = np.radians(0.25)  # of a clipped lamp's centroid
 # Of the plane's light: what the model of a whole shadow is off by, the same at all its points. Recovered fluxes of the
 # desk's three lamps and the bundled courtyard's sun, times their shares of that light, were off by 0.007 (rms); of the
 # courtyard photographed 24 times at 512 px by 0.012: at the ball's foot camera and photographer hide 0.5 to 1.6 % more
-# of the sky than from its centre.
+# of the sky than from its centre. With 0.012 stated, 31 courtyards had 62, 81 and 100 % of their objects' means within
+# intervals of 50, 68 and 95 %.
 SHADOW_SIGMA = 0.010
 REFLECTANCE_SIGMA = 0.02  # of the ball, for what it mirrors to the plane
 SHADED = 3.0  # sigma below what lamps must at least give it: a card that something shades
