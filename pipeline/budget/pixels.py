@@ -22,9 +22,9 @@ PLATE_PX = 5.0
 # as its plate, five seeds of 16 samples against 160: 50, 68, 95 % intervals of the RMS itself hold 74, 86 and 97 % of
 # object pixels and 78, 89 and 98 % of shadow pixels; of this share of it 48, 63 and 86, and 54, 68 and 89 %.
 TYPICAL = 0.5
-# Of the squared disagreement of two interpolations, what the plate's own errs. Pixels that show only the plate, of desk
-# and courtyard at 512 px, bilinear: intervals of 50, 68 and 95 % hold 30, 42, 68 and 27, 38, 61 % without it, 51, 66, 89
-# and 56, 71, 93 with three quarters. Of pixels in shadows three quarters hold 57, 75 and 95 % (59 captures): less is it.
+# Of the squared disagreement of two interpolations, what the plate's own errs. Of pixels that show only the plate (desk
+# and courtyard, 512 px, bilinear) intervals of 50, 68 and 95 % hold 30, 42, 68 and 27, 38, 61 % without it, 51, 66, 89
+# and 56, 71, 93 with three quarters. In shadows those hold 57, 75 and 95 % (59 captures): it is less.
 INTERPOLATED = 0.6
 SHADOW = 0.05  # relative change of the plate that is called a shadow, as `evaluate` has it
 COVERED = 0.999
