@@ -10,6 +10,7 @@ import pytest
 from pipeline.conventions import CLIPPED
 from pipeline.image import colour
 from pipeline.image.demosaic import demosaic, demosaic_variance, interpolation_variance
+from pipeline.image.small_lights import RESTORED
 from pipeline.image.vignetting import radius_squared
 from pipeline.run import formats
 from pipeline.run.artifacts import MOSAICS
@@ -141,3 +142,30 @@ def test_flat_photographs_are_views_of_their_own_and_reach_develop(tmp_path):
     (tmp_path / "capture.toml").write_text(MANIFEST.replace('"ball"', '"flat_1"', 1))
     with pytest.raises(ManifestError, match=r"\['flat_1'\] are those of photographs"):
         ingest.compute(tmp_path, None, knobs.Ingest())
+
+
+def test_a_ball_loses_its_small_lights_aliases_and_says_so():
+    """A lamp in a view of a ball, between photosites: its colours' sums are those of its light; the plate's stay."""
+    rows, columns = np.mgrid[:40, :40]
+    lamp = np.exp(-((rows - 20.3) ** 2 + (columns - 18.6) ** 2) / (2 * 0.6**2))
+    white = NEUTRAL / NEUTRAL[1]
+    cell = white[["RGB".index(letter) for letter in "RGGB"]].reshape(2, 2)
+    seen = ((0.002 + lamp) * np.tile(cell, (20, 20))).astype(np.float32)
+    planes = {"Y": seen, "variance": 1e-8 * seen, "mask": np.zeros((40, 40), np.uint32)}
+    header = {"insitu:cfa": "RGGB", "insitu:colour": json.dumps(profile())}
+    views = {view: Raster(dict(planes), "camera_rgb", dict(header)) for view in ("plate", "ball_a")}
+    facts = {"ball": [{"name": "ball_a"}]}
+    result = develop.compute(facts, views, knobs.Develop(demosaic="bilinear"))
+    plate, ball = (result.outputs["photographs"][view] for view in ("plate", "ball_a"))
+    off = [np.abs(one.rgb().sum((0, 1), dtype=float) / (0.002 * 1600 + lamp.sum()) - 1).max() for one in (plate, ball)]
+    assert off[1] < 0.1 * off[0]
+    assert (ball.attributes[RESTORED], RESTORED in plate.attributes) == ("1", False)
+    assert result.numbers["views"]["ball_a"]["small_lights"] == 1
+    (row,) = (row for row in result.evidence if row["term"] == "aliases of small lights")
+    assert row["modelled"] is True
+    views["ball_a"].channels["mask"][20, 19] = CLIPPED
+    result = develop.compute(facts, views, knobs.Develop(demosaic="bilinear"))
+    assert result.outputs["photographs"]["ball_a"].attributes[RESTORED] == "0"
+    (row,) = (row for row in result.evidence if row["term"] == "aliases of small lights")
+    assert row["modelled"] is False
+    assert "ball_a 1" in row["because"]
