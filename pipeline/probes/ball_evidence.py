@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.image.colour import Space, convert
+from pipeline.image.demosaic import ADDED_PX2, METHOD
 from pipeline.probes import ball_dirt, ball_shape
 from pipeline.probes.ball_pairs import Pairs, Sight, ball_pixels, neighbourhood, pixel_step, plane_pairs
 from pipeline.probes.ball_shape import Dents
@@ -18,7 +19,7 @@ from pipeline.probes.observation import Shots, ViewMap
 from pipeline.run.errors import NumericalError
 from pipeline.run.evidence import TRIED
 from pipeline.transport.conductors import preset
-from pipeline.types import Raster
+from pipeline.types import Raster, View
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,14 @@ class BallEvidence:
     numbers: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     evidence: list[dict[str, Any]] = field(default_factory=list)
+
+
+def blur_of(photograph: Raster, view: View) -> float | None:
+    """Standard deviation [px] of what a pixel takes in: lens, pixel and demosaicking; None where no print tells."""
+    if view.softness_px is None:
+        return None
+    added = ADDED_PX2[photograph.attributes[METHOD]][0] if METHOD in photograph.attributes else 0.0
+    return float(np.sqrt(view.softness_px**2 + added))
 
 
 def examine(
@@ -49,6 +58,7 @@ def examine(
             ball.fit.centre,
             radius,
             glass,
+            blur_of(shots.photographs[name], shots.views[name]),
         )
         for name, ball in found.items()
     }

@@ -20,9 +20,13 @@ from pipeline.probes.glass import Glass, leaving
 from pipeline.probes.observation import lookup_channels
 from pipeline.types import Camera, Raster
 
-SPLIT = 6  # rays per axis over the two pixels that a demosaicked pixel takes in
+SPLIT = 6  # rays per axis over what a pixel takes in
+FAR = 2.0  # standard deviations of its blur, to either side
 MAX_ACROSS = 160  # pixels across the ball that are looked at: larger balls are looked at in steps
 NEAREST, FARTHEST = 1.3, 5.0  # distance from the foot, in radii: nearer is the contact's shadow, farther grazing
+# How much farther balls of so many px begin, by their size's square: they do not resolve that shadow. From 1.3 to 1.7
+# radii desk's table is 2 % darker in balls of 43 px than beside them, in balls of 86 px 0.1 %.
+UNRESOLVED, UNRESOLVED_PX = 0.4, 43.0
 BESIDE_PX = 4.0  # about the outline, where the direct picture may hold some of the ball
 LOOKUP_ROW = 1024
 AROUND = 2 * np.pi * np.arange(90) / 90
@@ -33,7 +37,8 @@ class Sight:
     """One view of the ball: its picture (H, W, 8) as `lookup_channels` has it, lens, pose, centre in its frame [m].
 
     The picture may be a part of the photograph, in larger pixels: ``corner`` column and row, and ``binned`` pixels.
-    ``glass`` before the mirror, if any.
+    ``glass`` before the mirror, if any. ``blur_px``: what a pixel takes in, standard deviation along an axis, in pixels
+    of the picture; where nothing is said two pixels, as a tent.
     """
 
     picture: np.ndarray
@@ -44,6 +49,7 @@ class Sight:
     corner: tuple[int, int] = (0, 0)
     binned: int = 1
     glass: Glass | None = None
+    blur_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -79,9 +85,12 @@ class Pairs:
 
 def neighbourhood(
     photograph: Raster, camera: Camera, world_from_camera: np.ndarray, centre: np.ndarray, radius: float,
-    glass: Glass | None = None,
+    glass: Glass | None = None, blur_px: float | None = None,
 ) -> Sight:  # fmt: skip
-    """The ball and the plane around it, as far as `FARTHEST`; binned when the ball is larger than needed."""
+    """The ball and the plane around it, as far as `FARTHEST`; binned when the ball is larger than needed.
+
+    ``blur_px``: of a pixel of the photograph, see `Sight`.
+    """
     size = np.array([camera.width, camera.height])
     outline = sphere_fit.silhouette(camera, centre, radius, AROUND)[0]
     around = FARTHEST * radius * np.stack([np.cos(AROUND), 0 * AROUND, np.sin(AROUND)], -1)
@@ -100,9 +109,11 @@ def neighbourhood(
         "fx": camera.fx / binned, "fy": camera.fy / binned, "cx": (camera.cx - int(low[0])) / binned,
         "cy": (camera.cy - int(low[1])) / binned, "width": int(shape[0]), "height": int(shape[1]),
     }  # fmt: skip
+    if blur_px is not None:
+        blur_px = float(np.sqrt(blur_px**2 + (binned**2 - 1) / 12) / binned)
     return Sight(
         found, camera.model_copy(update=moved), world_from_camera, centre, radius, (int(low[0]), int(low[1])), binned,
-        glass,
+        glass, blur_px,
     )  # fmt: skip
 
 
@@ -118,15 +129,15 @@ def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: i
     picture, camera, world_from_camera = sight.picture, sight.camera, sight.world_from_camera
     centre, radius = sight.centre, sight.radius
     px = ball_pixels(sight, 1 if every else pixel_step(sight))
-    split = split or (SPLIT // 2 if every else SPLIT)
-    spread = ((np.arange(split) + 0.5) / split - 0.5) * 2  # +- 1 px about the centre
-    dx, dy = (part.ravel() for part in np.meshgrid(spread, spread))
-    share = (1 - np.abs(dx)) * (1 - np.abs(dy))
-    share /= share.sum()
+    spread, part = taken_in(split or (SPLIT // 2 if every else SPLIT), None if every else sight.blur_px)
+    dx, dy = (offset.ravel() for offset in np.meshgrid(spread, spread))
+    share = np.outer(part, part).ravel()
     _, sine, _, point = ball_points(sight, px + 0.5)
     foot = _foot(world_from_camera, centre)
     near = np.linalg.norm((point - foot)[:, ::2], axis=-1) / radius
-    keep = (sine < limit) & (near > NEAREST) & (near < (4 if every else 1) * FARTHEST)
+    size_px = camera.fx * radius / np.linalg.norm(centre) * sight.binned
+    nearest = NEAREST if every else NEAREST + UNRESOLVED * (UNRESOLVED_PX / size_px) ** 2
+    keep = (sine < limit) & (near > nearest) & (near < (4 if every else 1) * FARTHEST)
     px, sine, point = px[keep], sine[keep], point[keep]
     if not len(px):
         return _none()
@@ -147,6 +158,14 @@ def plane_pairs(sight: Sight, limit: float = 0.97, every: bool = False, split: i
     tilt = slope - position[1] / np.linalg.norm(position - point, axis=-1)
     azimuth = np.arctan2(*(point - foot)[:, ::2].T)
     return Pairs(px, sine, point, own[:, :3], own[:, 3:6], direct, variance, texture, slope, tilt, azimuth).at(good)
+
+
+def taken_in(split: int, blur_px: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (split,) [px] along an axis, and what a pixel takes in from there: shares of a Gaussian, or a tent."""
+    even = ((np.arange(split) + 0.5) / split - 0.5) * 2  # -1 to 1
+    part = 1 - np.abs(even) if blur_px is None else np.exp(-((FAR * even) ** 2) / 2)
+    part /= part.sum()
+    return even if blur_px is None else even * blur_px / np.sqrt(part @ even**2), part
 
 
 def _with_ghosts(sight: Sight, px: np.ndarray, found: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
