@@ -6,7 +6,7 @@ and thrown light make; each the median over its pixels. The one number is the la
 sampling    noise over the samples n, from differences of pilot renders of other samples and seeds; beyond them n^-1/2
 map         c / w over the probe's width w, from two pilot renders under the map and under it at half its width
 lamp        what the stated sigmas of the lamps' flux do to a pixel, by a pilot render without each; the same for all
-            settings, as how a photograph samples a lamp is not the map's doing (desk: 6.6, 6.5, 6.6 % at 512 to 2048)
+            settings, as how a photograph samples a lamp is not the map's doing
 stated      the other standard uncertainties of the stages before (exposures, ball, light, plate), for all settings
 
 Of the last two, `EXPECTED` of the standard uncertainty: the error that a run has in the mean, not its root mean square.
