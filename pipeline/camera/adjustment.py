@@ -1,7 +1,9 @@
 """Joint adjustment of one lens and the poses of its board photographs, with the lens's covariance.
 
 Gauss-Newton with Levenberg's damping on the reprojection error; the poses are eliminated by Schur's complement. Which
-of the lens's numbers are free is a matrix, so that one focal length for both axes is a column, not a case.
+of the lens's numbers are free is a matrix, so that one focal length for both axes is a column, not a case. Terms that
+are left out are no zeros known for sure: what they may be, and what the fitted numbers took up of them, is a covariance
+of its own (considered parameters: Schmidt, "Application of state-space methods to navigation problems", 1966).
 """
 
 from __future__ import annotations
@@ -83,6 +85,37 @@ def adjust(
             if damping > 1e8:
                 break
     return _finish(camera, state, world_m, px, free, system)
+
+
+def considered(
+    found: Adjustment,
+    world_m: list[np.ndarray],
+    px: list[np.ndarray],
+    free: np.ndarray,
+    left_out: np.ndarray,
+    sigma: np.ndarray,
+) -> np.ndarray:
+    """(L, L) covariance of the lens that its left-out terms add, after a fit of the ``free`` columns (L, K).
+
+    ``left_out`` (L, M): columns of terms that stayed zero; ``sigma`` (M,): what lenses have of them. With the reduced
+    normal equations H of both, a term p moves what was fitted by A p, A = H_ff^-1 H_fp, and is itself off by -p. What p
+    may be is its second moment once the photographs have spoken: their score at zero and H_pp - H_pf A, with the prior.
+    """
+    both = np.concatenate([free, left_out], 1)
+    lens_lens, cross, pose_pose, gradients, _ = _normal_equations(found.camera, found.poses, world_m, px, both)
+    reduced, right = lens_lens.copy(), gradients[0].copy()
+    for c, p, g in zip(cross, pose_pose, gradients[1], strict=True):
+        reduced -= c @ np.linalg.solve(p, c.T)
+        right -= c @ np.linalg.solve(p, g)
+    kept = free.shape[1]
+    taken_up = np.linalg.solve(reduced[:kept, :kept], reduced[:kept, kept:])
+    information = reduced[kept:, kept:] - reduced[kept:, :kept] @ taken_up
+    score = right[kept:] - taken_up.T @ right[:kept]
+    variance = np.linalg.inv(information / found.sigma_px**2 + np.diag(sigma**-2))
+    mean = variance @ score / found.sigma_px**2
+    moved = free @ taken_up - left_out
+    covariance = moved @ (variance + np.outer(mean, mean)) @ moved.T
+    return np.asarray((covariance + covariance.T) / 2)
 
 
 _System = tuple[np.ndarray, list[np.ndarray], list[np.ndarray], tuple[np.ndarray, list[np.ndarray]], float]

@@ -5,7 +5,8 @@ k6, are offered in turn, twice; a term stays when held-out photographs gain more
 standard errors of a Gaussian) and do so consistently. A fisheye has a ladder of its own, climbed on evidence only, and
 is judged on the same held-out photographs, those of the lens that explains most of them: a photograph that speaks
 against a lens must not be left out for it. The model with fewer terms wins a tie; where photographs do not tell two
-families apart that differ over the frame, that is said.
+families apart that differ over the frame, that is said. Decentring p1 p2 that is left out is in the lens's covariance:
+the principal point imitates it, so that residuals show little of it, but boards and things elsewhere do not move alike.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.camera.adjustment import Adjustment, adjust, free_columns, lens_vector, with_lens
+from pipeline.camera.adjustment import Adjustment, adjust, considered, free_columns, lens_vector, with_lens
 from pipeline.camera.distortion import model_of
 from pipeline.camera.lens import project, unproject
 from pipeline.camera.opencv_bridge import first_calibration
@@ -31,6 +32,8 @@ WIDE_LADDER: tuple[tuple[str, ...], ...] = (("k1", "k2", "k3", "k4", "k5", "k6")
 EQUIDISTANT = np.array([4 / 15, 0, 0, 0, 0, 9 / 15, 0, 0])  # atan(r) / r as a ratio of polynomials (Pade)
 ROUGH_PX = 0.3  # of a corner: beyond it another lens is tried
 FISHEYE_LADDER: tuple[tuple[str, ...], ...] = (("k1",), ("k2",), ("fy",), ("k3", "k4"))
+DECENTRING = ("p1", "p2")
+DECENTRING_SIGMA = 5e-4  # of p1 and p2 in lenses that are sold: a tenth to twice of it
 RATIONAL = LADDER[-1]  # the denominator: nothing to divide where k1 alone explains the bend
 FEWEST_PHOTOS = 3
 SAME_FOCAL = 0.01
@@ -339,7 +342,20 @@ def climb(start: Camera, poses: list[np.ndarray], photos: Photos, ladder: tuple[
     for step, entry in evidence.items():
         if not entry["modelled"]:
             entry |= cost_of(step, terms, chosen, start, poses, photos)
+    if DECENTRING in ladder and not set(DECENTRING) & set(terms):
+        chosen = perhaps_decentred(chosen, photos, terms)
+        evidence[DECENTRING]["because"] += f"; what is left out of {DECENTRING_SIGMA:g} each is in the covariance"
     return Climbed(chosen, photos, terms, best, errors, list(evidence.values()))
+
+
+def perhaps_decentred(fit: Adjustment, photos: Photos, terms: tuple[str, ...]) -> Adjustment:
+    """A lens fitted without decentring, its covariance with what that may be, which the principal point took up."""
+    lens, count = fit.camera, len(fit.camera.distortion)
+    free = free_columns(tuple(term for term in terms if term != "fy"), "fy" not in terms, count)
+    left_out = free_columns(DECENTRING, True, count)[:, -2:]
+    sigma = np.full(2, DECENTRING_SIGMA)
+    more = considered(fit, photos.world_m, photos.px, free, left_out, sigma)
+    return replace(fit, camera=lens.model_copy(update={"covariance": lens.covariance + more}))
 
 
 def forced(start: Camera, poses: list[np.ndarray], photos: Photos, distortion: str) -> Climbed:
