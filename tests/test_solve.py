@@ -77,6 +77,8 @@ def test_a_whole_picture_costs_its_area_and_its_samples():
     assert (flat, each) == (pytest.approx(STARTING + 4 * 0.6), pytest.approx(2e-6))
     found = model.fitted(longer())
     assert found.work.at(8) == pytest.approx(6e5 * 2 ** (2 - FEWER_TRACED))
+    assert found.work.at(32) == pytest.approx(4 * found.work.at(8))  # proportional, as the pilot's are
+    assert found.work.at(256) == pytest.approx(8**model.LEAVING * found.work.at(32))
     assert found.cost(Setting(64, 512))["render"] > 1.9 * found.cost(Setting(24, 512))["render"]
 
 
