@@ -16,6 +16,8 @@ from typing import Any
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 Records = dict[str, Any]
 Value = Callable[[Records], float]
+CLASSES = ("pixels", "region means")  # of places, as the coverage's record has them
+APART = ("object pixels", "shadow pixels", "object means", "shadow means")
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,16 @@ def bounded(kind: str) -> Value:
     return lambda records: float(min(records["budget"]["kinds"][kind]["bounded"].values()))
 
 
-def intervals(kind: str) -> Value:
-    """How many of the twelve intervals (four kinds of places, three shares) hold the truth as often as they state."""
+def intervals(kind: str | None, places: tuple[str, ...]) -> Value:
+    """How many of the intervals of some places (three shares each) hold the truth as often as they state.
+
+    Of one kind of captures, or of all that are pooled.
+    """
 
     def read(records: Records) -> float:
-        places = records["budget"]["kinds"][kind]["coverage"].values()
-        return float(sum(holds for place in places for holds in place["truth"]["holds"].values()))
+        budget = records["budget"]
+        found = budget["kinds"][kind]["coverage"] if kind else budget["pooled"]
+        return float(sum(holds for place in places for holds in found[place]["truth"]["holds"].values()))
 
     return read
 
@@ -139,10 +145,13 @@ PROMISES = [
     Promise("whole", "--help, --version and refused manifests, wall", 0.3, None,
             "`test_cli::test_quick_answers_are_quick_and_leave_numpy_alone`", unit="s"),
     *(
-        Promise("uncertainty", f"intervals of 12 that hold, 100 captures of {kind}", 12, intervals(kind),
-                "`make bench-budget`", least=True)
-        for kind in ("desk", "courtyard", "corner")
+        Promise("uncertainty", f"intervals of {3 * len(places)} that hold: {what}, 100 captures of {name}",
+                3 * len(places), intervals(kind, places), "`make bench-budget`", least=True)
+        for what, places in (("pixels, region means", tuple(CLASSES)), ("objects and shadows apart", APART))
+        for name, kind in (("desk, of courtyard", None), ("desk", "desk"), ("courtyard", "courtyard"))
     ),
+    Promise("uncertainty", "intervals of 6 that hold: pixels, region means, 100 captures of corner", 6,
+            intervals("corner", tuple(CLASSES)), "`make bench-budget`", least=True),
     Promise("uncertainty", "errors within 1.96 sigma and the bound that is named, 100 captures of corner",
             0.95, bounded("corner"), "`make bench-budget`", least=True),
     Promise("extremes", "cases seen as they were defined", 1.0, extremes, "`make extremes`", least=True),
