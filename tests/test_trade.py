@@ -201,7 +201,7 @@ def test_the_whole_of_a_trade_on_made_up_costs(toy, tmp_path):
     assert kinds[:3] == ["repeat", "repeat", "base"]
     assert kinds.count("knob") == 3 + 6 + 1
     combined = {r["label"] for r in session.rows if r["kind"] == "design"}
-    assert combined == {"probe.width=256 render.samples=16", "probe.width=2048 render.samples=512"}
+    assert combined == {"probe.width=256 render.samples=16", "probe.width=2048 render.samples=128"}
     assert [r["label"] for r in session.rows if r["kind"] == "knob" and r["cpu_seconds"] > 100] == [
         "render.samples=128", "render.samples=512",
     ]  # fmt: skip
