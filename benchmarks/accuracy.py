@@ -148,7 +148,7 @@ PROMISES = [
         Promise("uncertainty", f"intervals of {3 * len(places)} that hold: {what}, 100 captures of {name}",
                 3 * len(places), intervals(kind, places), "`make bench-budget`", least=True)
         for what, places in (("pixels, region means", tuple(CLASSES)), ("objects and shadows apart", APART))
-        for name, kind in (("desk, of courtyard", None), ("desk", "desk"), ("courtyard", "courtyard"))
+        for name, kind in (("desk", "desk"), ("courtyard", "courtyard"), ("rooms", "rooms"), ("each, pooled", None))
     ),
     Promise("uncertainty", "intervals of 6 that hold: pixels, region means, 100 captures of corner", 6,
             intervals("corner", tuple(CLASSES)), "`make bench-budget`", least=True),
