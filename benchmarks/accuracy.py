@@ -147,11 +147,11 @@ PROMISES = [
     *(
         Promise("uncertainty", f"intervals of {3 * len(places)} that hold: {what}, 100 captures of {name}",
                 3 * len(places), intervals(kind, places), "`make bench-budget`", least=True)
-        for what, places in (("pixels, region means", tuple(CLASSES)), ("objects and shadows apart", APART))
+        for what, places in (("pixels, region means", CLASSES), ("objects and shadows apart", APART))
         for name, kind in (("desk", "desk"), ("courtyard", "courtyard"), ("rooms", "rooms"), ("each, pooled", None))
     ),
     Promise("uncertainty", "intervals of 6 that hold: pixels, region means, 100 captures of corner", 6,
-            intervals("corner", tuple(CLASSES)), "`make bench-budget`", least=True),
+            intervals("corner", CLASSES), "`make bench-budget`", least=True),
     Promise("uncertainty", "errors within 1.96 sigma and the bound that is named, 100 captures of corner",
             0.95, bounded("corner"), "`make bench-budget`", least=True),
     Promise("extremes", "cases seen as they were defined", 1.0, extremes, "`make extremes`", least=True),

@@ -67,8 +67,6 @@ QUANTILES = {"50": 0.67449, "68": 1.0, "95": 1.95996}  # of |z|, normal
 BINS = np.array([-np.inf, -3, -2.5, -2, -1.5, -1, -0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, np.inf])
 DOCS = Path("docs/benchmarks")
 SAMPLES = Path("sample_captures")
-
-
 Records = list[dict[str, Any]]  # of one place
 
 
@@ -202,10 +200,13 @@ def coverage(z: np.ndarray) -> dict[str, Any]:
 
 
 def grouped(groups: list[Records]) -> dict[str, Any]:
-    """Coverage of the `CLASSES` and of each kind of place, over some places' records, against scatter and truth."""
+    """Coverage of the `CLASSES` and of each kind of place, over some places' records, against scatter and truth.
+
+    Of every place two captures at least, as `records_of` gives them.
+    """
     found: dict[str, dict[str, list[np.ndarray]]] = {name: {"scatter": [], "truth": []} for name in CLASSES}
     for records in groups:
-        spread = np.sqrt(len(records) / (len(records) - 1)) if len(records) > 1 else np.nan  # the mean took its share
+        spread = np.sqrt(len(records) / (len(records) - 1))  # the mean took its share of the scatter
         errors, sigmas = stacked(records, "error"), stacked(records, "sigma")
         for kind, error in errors.items():
             z = {"scatter": (error - error.mean(0)) / sigmas[kind] * spread, "truth": error / sigmas[kind]}
@@ -344,7 +345,12 @@ def photographed(kind: str, folder: Path, number: int) -> tuple[Any, Any]:
     """Scene and radiance of place ``number`` of a kind, kept while captures of the same place follow each other."""
     at = folders(kind, folder)[number] / "radiance"
     if kind == "rooms":
-        return rooms.room_of(number, at, photographed("desk", folder, 0)[1].boards)
+        drawn_by, now = at / "drawn_by", hashlib.sha256(Path(rooms.__file__).read_bytes()).hexdigest()
+        if not drawn_by.exists() or drawn_by.read_text() != now:
+            shutil.rmtree(at, ignore_errors=True)  # pictures of a room that is not drawn any more
+        found = rooms.room_of(number, at, photographed("desk", folder, 0)[1].boards)
+        drawn_by.write_text(now)
+        return found
     return place_of(SAMPLES / "scenes" / f"{kind}.toml", SAMPLES / kind, at)
 
 
