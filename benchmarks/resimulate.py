@@ -8,8 +8,10 @@ are rendered at that size.
 All is kept in FOLDER/radiance. Capture k then has its own photon and read noise, fixed pattern, hot photosites, JPEG
 noise of the board photographs, corners (so lens and pose of its own) and shutter: each setting of the dial is off by
 `DIAL`, each frame by `FRAME` more. Its cameras are turned by up to a pixel, so that lamps and edges fall otherwise
-on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`). How
-soft its ball views are, which decides how a mosaic samples small lamps and nobody states, is drawn from `BALL_PX`.
+on the mosaic; pictures and truth are resampled for that (splines of order 5 on a picture as soft as `BLUR_PX`). Ball
+views are rendered on `FINE` points to a pixel and axis, and turned there; then the lens acts, and then the pixels: of a
+lamp one or two photosites wide, what photosites make of it is all in the order of these. How soft its ball views are,
+which decides that and which nobody states, is drawn from `BALL_PX`.
 The ball's reflectance is stated off by what the probe stage takes such numbers to be off by.
 """
 
@@ -27,8 +29,9 @@ from pipeline.probes.ball_surface import GIVEN_SIGMA
 from pipeline.run.cli import say
 from pipeline.run.formats import read_exr, write_bytes
 from pipeline.simulation import capture, shapes
+from pipeline.simulation.leaving import glare
 from pipeline.simulation.lens import Lens, blur, look_at
-from pipeline.simulation.scene_file import SimulatedScene, load_scene
+from pipeline.simulation.scene_file import SimulatedScene, ViewFacts, load_scene
 from pipeline.simulation.world import Place
 from pipeline.transport.variant import use_mitsuba
 from stages import simulate
@@ -40,12 +43,16 @@ BALL_PX = (0.6, 0.85)  # of a ball view, uniform: from nearly as sharp as the bu
 DIAL = 0.01  # of log time, of each setting of the shutter; real ones are off by up to several percent
 CORNER_PX = 0.1  # of each corner, as the pose stage takes its own at the full size
 FRAME = 0.002  # of log time, of each frame: what one setting repeats to
+FINE = 4  # points to a pixel and axis of ball views, each a box: a lamp of a pixel is nowhere off by 2 % of its aliases
+FINE_SAMPLES = 16  # of each: the table's noise in a pixel, which no capture's variance has in it, is a percent
 TURN_PX = 1.0  # of each camera, either way: a whole period of the mosaic, so that lamps fall on it in every way alike
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Radiance (H, W, 3), ACEScg, through the lens: of the plate, of every ball view, of the board photographs."""
+    """Radiance (H, W, 3), ACEScg: of the plate and the board photographs, through the lens; of every ball view on
+    `FINE` points to a pixel and axis, before the lens.
+    """
 
     plate: np.ndarray
     balls: dict[str, np.ndarray]
@@ -121,11 +128,40 @@ def reduce_truth(bundled: Path, folder: Path, shape: tuple[int, int], factor: in
     return pictures["plate"]
 
 
-def sharpest(studio: simulate.Studio) -> simulate.Studio:
-    """With a lens as sharp as the sharpest that ball views are seen through."""
-    camera = studio.scene.camera.model_copy(update={"blur_sigma_px": BALL_PX[0]})
-    scene = studio.scene.model_copy(update={"camera": camera})
-    return simulate.Studio(scene, studio.mi, studio.place, studio.lens)
+def fine(studio: simulate.Studio) -> simulate.Studio:
+    """With `FINE` pixels to one of the camera's along a side, at `FINE_SAMPLES` each."""
+    camera, sampling = studio.scene.camera, studio.scene.sampling
+    camera = camera.model_copy(
+        update={n: getattr(camera, n) * FINE for n in ("fx", "fy", "cx", "cy", "width", "height")}
+    )
+    sampling = sampling.model_copy(update={"ball": FINE_SAMPLES})
+    scene = studio.scene.model_copy(update={"camera": camera, "sampling": sampling})
+    return simulate.Studio(scene, studio.mi, studio.place, capture.lens_of(camera))
+
+
+def ball_before_lens(studio: simulate.Studio, view: ViewFacts) -> np.ndarray:
+    """(H * FINE, W * FINE, 3) of a ball view; the smooth light that the ball throws is found at the camera's pixels."""
+    from scipy.ndimage import zoom
+
+    thrown = simulate.thrown_light(studio, view, simulate.mirrored_picture(studio, view))
+    spread = zoom(thrown, (FINE, FINE, 1), order=1, mode="nearest", grid_mode=True)
+    return np.asarray(simulate.mirrored_picture(fine(studio), view) + spread)
+
+
+def through_lens(scene: SimulatedScene, picture: np.ndarray, soft_px: float, turn: np.ndarray) -> np.ndarray:
+    """(H, W, 3) of a fine ball view, turned by ``turn`` (3, 3), behind lens and pixel of ``soft_px`` px together."""
+    from scipy.ndimage import gaussian_filter
+
+    lens = FINE * np.sqrt(soft_px**2 - 1 / 12)  # the boxes of the points make the pixel's
+    camera = scene.camera
+    large = Lens(
+        *(FINE * v for v in (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)),
+        capture.lens_of(camera).distortion,
+    )
+    moved = seen_turned(large, gaussian_filter(picture.astype(float), (lens, lens, 0), mode="nearest"), turn, order=3)
+    height, width = picture.shape[0] // FINE, picture.shape[1] // FINE
+    seen = moved.reshape(height, FINE, width, FINE, -1).mean((1, 3))
+    return np.asarray(glare(seen, scene.leave.glare, scene.leave.glare_radius_px))
 
 
 def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
@@ -139,7 +175,7 @@ def render(whole: SimulatedScene, bundled: Path, folder: Path) -> Pictures:
     plate = reduce_truth(bundled, folder / "truth", studio.shape, factor_of(whole), whole.camera.blur_sigma_px)
     record = capture.truth_record(scene, shoot, views, studio.place.ball_centre, {})
     capture.write_truth(folder / "truth" / "truth.json", record)
-    balls = {view.name: simulate.ball_picture(sharpest(studio), view) for view in scene.ball_view}
+    balls = {view.name: ball_before_lens(studio, view) for view in scene.ball_view}
     measure, sigma = studio.radiance(), scene.camera.blur_sigma_px
     boards = []
     for number, photo in enumerate(scene.calibration):
@@ -172,10 +208,10 @@ class Reshoot(capture.Shoot):
         self.now = 1.0
 
 
-def softer_px(scene: SimulatedScene) -> dict[str, float]:
-    """Sigma [px] that each ball view is blurred by beyond the least of `BALL_PX`."""
+def soft_px(scene: SimulatedScene) -> dict[str, float]:
+    """Sigma [px] of lens and pixel of each ball view."""
     random = np.random.default_rng([scene.seed, 8])
-    return {view.name: float(np.sqrt(random.uniform(*BALL_PX) ** 2 - BALL_PX[0] ** 2)) for view in scene.ball_view}
+    return {view.name: float(random.uniform(*BALL_PX)) for view in scene.ball_view}
 
 
 def turns(scene: SimulatedScene) -> dict[str, np.ndarray]:
@@ -196,14 +232,17 @@ def stated_wrongly(scene: SimulatedScene) -> SimulatedScene:
     return scene.model_copy(update={"ball": scene.ball.model_copy(update={"reflectance": told})})
 
 
-def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """A picture (H, W, C) as the camera sees it when it is turned by ``turn`` (3, 3) in its own frame."""
+def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray, order: int = 5) -> np.ndarray:
+    """A picture (H, W, C) as the camera sees it when it is turned by ``turn`` (3, 3) in its own frame.
+
+    Splines of ``order``: 5 for a picture as soft as `BLUR_PX`, 3 is as good where it is three times as soft.
+    """
     from scipy.ndimage import map_coordinates
 
     rows, columns = np.mgrid[: lens.height, : lens.width] + 0.5
     rays = np.stack([*lens.ideal_from_pixel(columns, rows), np.ones(rows.shape)], -1)
     x, y = (lens.project((rays @ turn.T).reshape(-1, 3)) - 0.5).T
-    channels = [map_coordinates(channel, [y, x], order=5, mode="nearest") for channel in np.moveaxis(values, -1, 0)]
+    channels = [map_coordinates(channel, [y, x], order=order, mode="nearest") for channel in np.moveaxis(values, -1, 0)]
     return np.stack(channels, -1).reshape(values.shape)
 
 
@@ -257,13 +296,13 @@ def photograph(scene: SimulatedScene, pictures: Pictures, number: int, shared: P
     scene = scene.model_copy(update={"seed": scene.seed + 1000 * (number + 1)})
     out.mkdir(parents=True)
     (out / "objects").symlink_to((shared / "objects").resolve())
-    turned, lens, soft = turns(scene), capture.lens_of(scene.camera), softer_px(scene)
+    turned, lens, soft = turns(scene), capture.lens_of(scene.camera), soft_px(scene)
     shoot = Reshoot(scene, out, capture.sensor_of(scene))
     capture.write_manifests(stated_wrongly(scene), out)
     write_poses(scene, out / "capture.toml", turned)
-    balls = {name: softened(ball, soft[name]) for name, ball in pictures.balls.items()}
-    shots = {**balls, "plate": pictures.plate}
-    capture.take_brackets(shoot, {name: seen_turned(lens, shot, turned[name]) for name, shot in shots.items()})
+    shots = {n: through_lens(scene, ball, soft[n], turned[n]) for n, ball in pictures.balls.items()}
+    shots["plate"] = seen_turned(lens, pictures.plate, turned[scene.plate.name])
+    capture.take_brackets(shoot, shots)
     for board, picture in enumerate(pictures.boards):
         write_bytes(out / "calibration" / f"calib_{board:02d}.jpg", capture.srgb_jpeg(picture, shoot.sensor, board))
     (out / "truth").mkdir()

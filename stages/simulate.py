@@ -157,35 +157,60 @@ def take_views(studio: Studio, shoot: capture.Shoot, progress: Callable[[str], N
 
 
 def ball_picture(studio: Studio, view: ViewFacts, frame: int | None = None) -> np.ndarray:
-    """(H, W, 3) radiance of a ball view, through the lens; of that frame of its bracket which a hand turned.
+    """(H, W, 3) radiance of a ball view, through the lens; of that frame of its bracket which a hand turned."""
+    black = mirrored_picture(studio, view, frame)
+    return studio.sharp(black + thrown_light(studio, view, black, frame))
 
-    Light that the ball throws onto the table is hard to sample: it would speckle the picture. It is smooth, since the
-    ball is convex, so it is found as the difference from a black ball under the same random numbers and smoothed, as
-    irradiance on each surface and as radiance in the ball; its energy is kept. What it throws of small lamps themselves
-    is traced from them (`pipeline.simulation.thrown`), and samples that meet one by way of the ball are left out here.
+
+def mirrored_picture(studio: Studio, view: ViewFacts, frame: int | None = None) -> np.ndarray:
+    """(H, W, 3) of a ball view before the lens' blur, without the light that the ball throws onto the table."""
+    return _mirrored(studio, view, frame, studio.scene.sampling.ball, np.inf)
+
+
+def _mirrored(studio: Studio, view: ViewFacts, frame: int | None, samples: int, brightest: float) -> np.ndarray:
+    """The same with so many samples; those above ``brightest`` count nothing."""
+    dark, ball = _dark(studio, view)
+    reflectance = studio.scene.ball.reflectance
+    base = mirrored_radiance(studio.mi, dark, studio.scene.sampling.depth, ball, reflectance, brightest)
+    pose, seed = _shot(studio, view, frame)
+    return studio.photograph(base, pose, samples, seed)
+
+
+def _shot(studio: Studio, view: ViewFacts, frame: int | None) -> tuple[np.ndarray, int]:
+    """Pose (4, 4) and seed of a ball view, or of that frame of its bracket."""
+    pose = turned(studio.pose(view), (0.0, 0.0) if frame is None else studio.scene.bracket.ball_turn_deg[frame])
+    number = studio.scene.ball_view.index(view)
+    return pose, 100_000 * (2 + number) + (0 if frame is None else 10_000 * (frame + 1))
+
+
+def _dark(studio: Studio, view: ViewFacts) -> tuple[Any, Any]:
+    """The place as a ball view shows it, with a black ball; and that ball."""
+    scene = studio.place.load(studio.place.photographer(studio.pose(view)), studio.place.ball(black=True))
+    return scene, next(shape for shape in scene.shapes() if shape.id() == "ball")
+
+
+def thrown_light(studio: Studio, view: ViewFacts, black: np.ndarray, frame: int | None = None) -> np.ndarray:
+    """(H, W, 3) of the light that the ball throws onto its surroundings, before the lens; ``black``: the rest.
+
+    It is hard to sample and would speckle the picture. It is smooth, since the ball is convex, so it is found as the
+    difference from a black ball under the same random numbers and smoothed, as irradiance on each surface and as
+    radiance in the ball; its energy is kept. What it throws of small lamps themselves is traced from them
+    (`pipeline.simulation.thrown`), and samples that meet one by way of the ball are left out here.
     """
     scene, place, sampling = studio.scene, studio.place, studio.scene.sampling
-    people = place.photographer(studio.pose(view))
-    pose = turned(studio.pose(view), (0.0, 0.0) if frame is None else scene.bracket.ball_turn_deg[frame])
-    seed = 100_000 * (2 + scene.ball_view.index(view)) + (0 if frame is None else 10_000 * (frame + 1))
+    pose, seed = _shot(studio, view, frame)
     small = [lamp for lamp in scene.light.lamp if lamp.diameter_deg < SMALL_DEG]
     lamps = min((scene.light.scale * max(lamp.radiance) for lamp in small), default=np.inf)
     some = max(16, sampling.ball // 4) if small else sampling.ball  # what is smoothed needs fewer
-    bright = path_radiance(studio.mi, place.load(people, place.ball()), sampling.depth, LAMP_ITSELF * lamps)
+    lit = place.load(place.photographer(studio.pose(view)), place.ball())
+    bright = path_radiance(studio.mi, lit, sampling.depth, LAMP_ITSELF * lamps)
     mirror = studio.photograph(bright, pose, some, seed)
-    dark = place.load(people, place.ball(black=True))
-    ball = next(shape for shape in dark.shapes() if shape.id() == "ball")
-
-    def behind(samples: int, brightest: float) -> np.ndarray:
-        base = mirrored_radiance(studio.mi, dark, sampling.depth, ball, scene.ball.reflectance, brightest)
-        return studio.photograph(base, pose, samples, seed)
+    without = _mirrored(studio, view, frame, some, LAMP_ITSELF * lamps) if small else black
+    dark, ball = _dark(studio, view)
 
     def seen(measure: Measure) -> np.ndarray:
         return studio.photograph(measure, pose, sampling.pass_samples, seed)
 
-    black = without = behind(sampling.ball, np.inf)
-    if small:
-        without = behind(some, LAMP_ITSELF * lamps)
     surfaces = [list(place.table_and_prints().values()), *([box] for box in place.boxes().values())]
     albedo = [seen(surface_albedo(studio.mi, dark, shapes)) for shapes in surfaces]
     thrown = spread_light(mirror - without, albedo, seen(first_hit(studio.mi, dark, [ball])))
@@ -195,7 +220,7 @@ def ball_picture(studio: Studio, view: ViewFacts, frame: int | None = None) -> n
         thrown = thrown + seen(
             seen_on_table(studio.mi, dark, light, place.ball_centre, surfaces[0], ball, reflectance)
         )  # fmt: skip
-    return studio.sharp(black + thrown)
+    return thrown
 
 
 def spread_light(light: np.ndarray, albedo: list[np.ndarray], cover: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ def restored(rgb: np.ndarray, mosaic: np.ndarray, cfa: str, unusable: np.ndarray
     """
     result, fitted, left = rgb.copy(), [], 0
     colours = _colours(mosaic.shape, cfa)
-    for place, reach in _candidates(rgb.sum(-1)):
+    for place, reach in candidates(rgb.sum(-1)):
         found = None
         if _usable(unusable, place, reach + MARGIN_PX):
             found = _fitted(mosaic, colours, place, reach)
@@ -89,7 +89,7 @@ def _colours(shape: tuple[int, ...], cfa: str) -> np.ndarray:
     return np.tile(cell, ((shape[0] + 1) // 2, (shape[1] + 1) // 2))[: shape[0], : shape[1]]
 
 
-def _candidates(grey: np.ndarray) -> list[tuple[tuple[int, int], int]]:
+def candidates(grey: np.ndarray) -> list[tuple[tuple[int, int], int]]:
     """Middle (row, column) and reach [px] of small bright spots that stand alone, brightest first."""
     from scipy.ndimage import label, maximum_filter, uniform_filter
 

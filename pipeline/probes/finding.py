@@ -108,6 +108,50 @@ def find_ball(
     return Found(fit, free, height, centre_world, way, prior_height is not None)
 
 
+def agreed(
+    found: dict[str, Found], photographs: dict[str, Raster], cameras: dict[str, Camera], views: dict[str, View],
+    radius: float,
+) -> dict[str, Found]:  # fmt: skip
+    """The balls with their rims fitted once more from where each other view sees the ball, whose sectors agree best.
+
+    Votes settle on whatever edge lies all around: a horizon that a ball mirrors just under its rim, in the tone of what
+    is behind it, held one of 41 px 3 px aside, and its fit stayed there. The true outline is where the sectors scatter
+    least: on ten views of five simulated rooms the fit of less scatter was the nearer one, or both lay within 0.1 px.
+    Pose and other rim put the start within a pixel or two. The view that scatters most goes first.
+    """
+    now = dict(found)
+    for name in sorted(now, key=lambda name: -now[name].fit.rms_px):
+        ball = now[name]
+        picture, variance, valid = measured(photographs[name])
+        camera_from_world = invert_rigid(views[name].world_from_camera)
+        for other, seen_from in now.items():
+            if other == name or not (ball.on_plane and seen_from.on_plane):
+                continue
+            start = transform_points(camera_from_world, seen_from.centre_world)
+            if start[2] <= radius:
+                continue
+            fit, free = sphere_fit.fit_sphere(
+                picture,
+                variance,
+                valid,
+                cameras[name],
+                radius,
+                start,
+                ball.height,
+                0.0,
+                ball.fit.contrast,
+                ball.fit.votes,
+            )
+            if fit.rms_px >= now[name].fit.rms_px or np.linalg.norm(fit.centre) <= 1.05 * radius:
+                continue
+            signals = signals_of(photographs[name], None)
+            fit, free = (replace(one, support=seen(signals, cameras[name], one, radius)) for one in (fit, free))
+            if fit.merit >= needed_merit("other_view", fit):
+                centre = transform_points(views[name].world_from_camera, fit.centre)
+                now[name] = replace(now[name], fit=fit, free=free, centre_world=centre)
+    return now
+
+
 def solve_radius(
     name: str, photograph: Raster, plate: Raster | None, camera: Camera, view: View,
     click_px: tuple[float, float] | None = None,

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.conventions import CLIPPED, invert_rigid, latlong_solid_angles
-from pipeline.probes import combine, photographer, sphere_fit
+from pipeline.probes import combine, photographer, shared_lamps, sphere_fit
 from pipeline.probes.anchor import anchored, anchored_radius
 from pipeline.probes.ball_evidence import examine, shape, without
 from pipeline.probes.ball_surface import Surface
-from pipeline.probes.finding import Found, complaints, discrepancy, find_ball, refuse_cut, solve_radius
+from pipeline.probes.finding import Found, agreed, complaints, discrepancy, find_ball, refuse_cut, solve_radius
 from pipeline.probes.glass import MOST, Glass, unghosted
 from pipeline.probes.glass_thickness import GlassEvidence, glimpse, judge, thickness, worth_measuring
 from pipeline.probes.mirror_geometry import Mirror, texel_directions
@@ -53,7 +53,6 @@ class MirrorBall:
         clicks = {ball["name"]: ball.get("click_px") for ball in facts["ball"]}
         stated = stated_glass(facts["probe"], radius)
         found: dict[str, Found] = {}
-        by_rim: dict[str, Found] = {}
         anchors: dict[str, dict[str, Any]] = {}
         for name in names:
             plate = photographs["plate"] if name in tripod else None
@@ -62,10 +61,12 @@ class MirrorBall:
                 name, photographs[name], plate, shots.camera_of(name), views[name], radius, near, clicks[name],
                 radius_sigma,
             )  # fmt: skip
-            warnings += complaints(name, found[name], radius)
-            by_rim[name] = found[name]
+        cameras = {name: shots.camera_of(name) for name in names}
+        by_rim = agreed(found, photographs, cameras, views, radius)
+        for name in names:
+            warnings += complaints(name, by_rim[name], radius)
             found[name], anchors[name] = anchored(
-                found[name], photographs[name], shots.camera_of(name), views[name], radius, stated
+                by_rim[name], photographs[name], shots.camera_of(name), views[name], radius, stated
             )
         fronts = {name: found[name].fit.centre for name, anchor in anchors.items() if stated is None and anchor["used"]}
         glassy = glass_of(shots, by_rim, radius, stated, fronts)
@@ -76,6 +77,7 @@ class MirrorBall:
                 )
             if not anchors[name]["used"]:
                 refuse_cut(name, found[name].fit, why=f" as {anchors[name]['why']}")
+        found, lamps = shared_lamps.tied(found, photographs, cameras, views, radius, glassy.glass)
         gloss = any(one["used"] and "left_with_its_contrast_px" in one for one in anchors.values())
         known = examine(shots, found, radius, min(grid.rim, SURFACE_RIM), glassy.glass, gloss)
         warnings += known.warnings + glassy.warnings
@@ -104,9 +106,10 @@ class MirrorBall:
         balls = {ball["name"]: ball_record(found[ball["name"]].fit, radius, known.surface) for ball in facts["ball"]}
         centre = np.mean([ball.centre_world for ball in found.values()], 0)
         evidence = [*reasons(found), centred(anchors), photographer.reason(people, len(maps)), *known.evidence]
-        evidence += glassy.evidence
+        evidence += [*glassy.evidence, shared_lamps.reason(lamps)]
+        numbers |= known.numbers | shaped.numbers | glassy.numbers
         return Observation(
-            shaped.maps, centre, balls, numbers | known.numbers | shaped.numbers | glassy.numbers, warnings,
+            shaped.maps, centre, balls, numbers | {"shared_lamps": lamps}, warnings,
             [*evidence, *shaped.evidence], scale_sigma=known.surface.sigma, smooth_only=shaped.smooth_only,
         )  # fmt: skip
 
