@@ -1,7 +1,7 @@
 """Do the stated uncertainties hold? Places photographed and built again and again; errors over sigma, pooled.
 
-    .venv/bin/python -m benchmarks.budget [COUNT] [--kind desk courtyard corner rooms] [--jobs 2] [--folder FOLDER]
-                                          [--judge] [--keep]
+    .venv/bin/python -m benchmarks.budget [COUNT] [--kind desk courtyard corner rooms small_balls] [--jobs 2]
+                                          [--folder FOLDER] [--judge] [--keep]
 
 Every capture (`benchmarks.resimulate`: own noise, shutter errors, corners, lens and pose) is built to the stage
 ``uncertainty`` and compared with the truth, scaled by the one factor s = median(LS_b / P) of the capture, as `evaluate`
@@ -57,10 +57,13 @@ KINDS = {
     "corner": "two bright walls close by that light the table and each other, no [room] stated: what the near field "
     "does to the light on the objects no sigma covers; `not_covered` bounds it, by 4 to 13 %",
     "rooms": "five desks under one to three lamps of 3 to 8 degrees; lamps, window, walls, table, ball and objects are "
-    "drawn anew for each (`benchmarks.rooms`): five draws of what a place's captures share",
+    "drawn anew for each (`benchmarks.rooms`): five draws of what a place's captures share; balls of 80 to 95 px, as "
+    "the guide to shooting asks",
+    "small_balls": "the same five rooms with balls of 36 to 50 px, half of what the guide to shooting asks for",
 }
-PLACES = {"rooms": 5}  # of a kind; 1 where nothing is said
-NOT_COVERED = ("corner",)  # kinds whose light no sigma holds: bounded and named, and pooled with no other
+PLACES = dict.fromkeys(rooms.BALL_M, 5)  # of a kind; 1 where nothing is said
+# Kinds pooled with no other: light that no sigma holds, bounded and named; balls that the build itself calls too small.
+NOT_COVERED = ("corner", "small_balls")
 CLASSES = {"pixels": ("object pixels", "shadow pixels"), "region means": ("object means", "shadow means")}
 EXPECTED = {"50": (0.45, 0.55), "68": (0.62, 0.74), "95": (0.90, 0.98)}
 QUANTILES = {"50": 0.67449, "68": 1.0, "95": 1.95996}  # of |z|, normal
@@ -74,7 +77,7 @@ def code(kind: str) -> str:
     """Digest of all that a record depends on: stages up to the last that is run, the simulator, and what is asked."""
     total = hashlib.sha256(repr((SETTINGS, APART, TILE, FEWEST)).encode())
     total.update(Path(resimulate.__file__).read_bytes())
-    if kind == "rooms":
+    if kind in rooms.BALL_M:
         total.update(Path(rooms.__file__).read_bytes())
     for name in (*NAMES[: NAMES.index("uncertainty") + 1], "simulate"):
         total.update(digest(f"stages.{name}").encode())
@@ -344,11 +347,11 @@ def page(found: dict[str, Any], command: str) -> str:
 def photographed(kind: str, folder: Path, number: int) -> tuple[Any, Any]:
     """Scene and radiance of place ``number`` of a kind, kept while captures of the same place follow each other."""
     at = folders(kind, folder)[number] / "radiance"
-    if kind == "rooms":
+    if kind in rooms.BALL_M:
         drawn_by, now = at / "drawn_by", hashlib.sha256(Path(rooms.__file__).read_bytes()).hexdigest()
         if not drawn_by.exists() or drawn_by.read_text() != now:
             shutil.rmtree(at, ignore_errors=True)  # pictures of a room that is not drawn any more
-        found = rooms.room_of(number, at, photographed("desk", folder, 0)[1].boards)
+        found = rooms.room_of(number, kind, at, photographed("desk", folder, 0)[1].boards)
         drawn_by.write_text(now)
         return found
     return place_of(SAMPLES / "scenes" / f"{kind}.toml", SAMPLES / kind, at)

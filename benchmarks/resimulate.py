@@ -152,13 +152,9 @@ def through_lens(scene: SimulatedScene, picture: np.ndarray, soft_px: float, tur
     """(H, W, 3) of a fine ball view, turned by ``turn`` (3, 3), behind lens and pixel of ``soft_px`` px together."""
     from scipy.ndimage import gaussian_filter
 
-    lens = FINE * np.sqrt(soft_px**2 - 1 / 12)  # the boxes of the points make the pixel's
-    camera = scene.camera
-    large = Lens(
-        *(FINE * v for v in (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)),
-        capture.lens_of(camera).distortion,
-    )
-    moved = seen_turned(large, gaussian_filter(picture.astype(float), (lens, lens, 0), mode="nearest"), turn, order=3)
+    sigma = FINE * np.sqrt(soft_px**2 - 1 / 12)  # the boxes of the points make the pixel's
+    soft = gaussian_filter(picture.astype(float), (sigma, sigma, 0), mode="nearest")
+    moved = seen_turned(capture.lens_of(scene.camera), soft, turn, FINE)
     height, width = picture.shape[0] // FINE, picture.shape[1] // FINE
     seen = moved.reshape(height, FINE, width, FINE, -1).mean((1, 3))
     return np.asarray(glare(seen, scene.leave.glare, scene.leave.glare_radius_px))
@@ -232,18 +228,23 @@ def stated_wrongly(scene: SimulatedScene) -> SimulatedScene:
     return scene.model_copy(update={"ball": scene.ball.model_copy(update={"reflectance": told})})
 
 
-def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray, order: int = 5) -> np.ndarray:
+def seen_turned(lens: Lens, values: np.ndarray, turn: np.ndarray, finer: int = 1) -> np.ndarray:
     """A picture (H, W, C) as the camera sees it when it is turned by ``turn`` (3, 3) in its own frame.
 
-    Splines of ``order``: 5 for a picture as soft as `BLUR_PX`, 3 is as good where it is three times as soft.
+    ``finer``: points of the picture to a pixel of the lens and axis. Splines of order 5, of a picture as soft as
+    `BLUR_PX`; of order 3 where the points are finer, as soft to them as to pixels and more.
     """
-    from scipy.ndimage import map_coordinates
+    from scipy.ndimage import map_coordinates, zoom
 
     rows, columns = np.mgrid[: lens.height, : lens.width] + 0.5
     rays = np.stack([*lens.ideal_from_pixel(columns, rows), np.ones(rows.shape)], -1)
-    x, y = (lens.project((rays @ turn.T).reshape(-1, 3)) - 0.5).T
+    moved = lens.project((rays @ turn.T).reshape(-1, 3)).reshape(*rows.shape, 2) - np.stack([columns, rows], -1)
+    if finer > 1:  # by how much is smooth
+        moved = finer * zoom(moved, (finer, finer, 1), order=1, mode="nearest", grid_mode=True)
+    y, x = np.mgrid[: values.shape[0], : values.shape[1]] + np.moveaxis(moved[..., ::-1], -1, 0)
+    order = 5 if finer == 1 else 3
     channels = [map_coordinates(channel, [y, x], order=order, mode="nearest") for channel in np.moveaxis(values, -1, 0)]
-    return np.stack(channels, -1).reshape(values.shape)
+    return np.stack(channels, -1)
 
 
 def write_truth_of(scene: SimulatedScene, shared: Path, out: Path, turned: dict[str, np.ndarray]) -> None:

@@ -55,6 +55,8 @@ def test_rooms_keep_lamps_apart_and_in_sight(number):
     """A room is the same each time; its lamps stand apart, and above whoever stands behind a camera."""
     room = rooms.drawn(number)
     assert room == rooms.drawn(number)
+    assert room.ball.diameter_m > rooms.drawn(number, "small_balls").ball.diameter_m
+    assert room.light == rooms.drawn(number, "small_balls").light
     assert room.name != rooms.drawn(number + 1).name
     assert room.light != rooms.drawn(number + 1).light
     assert (room.camera.width, room.camera.height) == (512, 384)
