@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import budget, rooms
 from pipeline.simulation.light import unit_direction
+from pipeline.simulation.scene_file import load_scene
 
 
 def records(count: int, regions: int, spread: float, bias: float, seed: int) -> budget.Records:
@@ -64,6 +65,8 @@ def test_rooms_keep_lamps_apart_and_in_sight(number):
     towards = [unit_direction(lamp.azimuth_deg, lamp.elevation_deg) for lamp in room.light.lamp]
     for i, first in enumerate(towards):
         assert all(first @ other <= np.cos(np.radians(rooms.APART_DEG)) + 1e-9 for other in towards[:i])
+    window, cameras = room.light.softbox[0].azimuth_deg, rooms.cameras(load_scene(rooms.DESK))
+    assert all(rooms.apart(window, camera) >= rooms.WINDOW_CLEAR_DEG for camera in cameras)
     camera = np.array(room.plate.position_m)
     x, z = room.ball.position_m
     behind = np.degrees(np.arctan2(camera[0] - x, z - camera[2]))
