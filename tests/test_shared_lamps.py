@@ -22,10 +22,13 @@ CENTRE = np.array([0.0, RADIUS, 0.0])
 CAMERA = Camera(width=300, height=260, fx=620.0, fy=620.0, cx=150.0, cy=130.0)
 POSES = {"a": look_at((0.30, 0.28, 0.12), (0.03, 0.02, 0.0)), "b": look_at((-0.20, 0.30, 0.28), (0.0, 0.03, 0.0))}
 LAMPS = [Lamp((0.3, 0.8, 0.4), 0.06, 60.0), Lamp((-0.4, 0.7, 0.5), 0.05, 90.0), Lamp((0.1, 0.7, -0.6), 0.05, 70.0)]
-VIEWS = {
-    name: View(world_from_camera=pose, covariance=1e-8 * np.eye(6), route="given", rms_px=0.1, points=20)
-    for name, pose in POSES.items()
-}
+
+
+def view_of(pose: np.ndarray) -> View:
+    return View(world_from_camera=pose, covariance=1e-8 * np.eye(6), route="given", rms_px=0.1, points=20)
+
+
+VIEWS = {name: view_of(pose) for name, pose in POSES.items()}
 CAMERAS = dict.fromkeys(POSES, CAMERA)
 
 
@@ -84,6 +87,21 @@ def test_views_that_contradict_each_other_state_more(pictures):
     for name, one in tied.items():
         raised = np.trace(one.fit.covariance) / np.trace(found[name].fit.covariance)
         assert raised == pytest.approx(numbers["chi2"] / (2 * len(LAMPS)))
+
+
+def test_a_third_view_brings_two_freedoms_more(pictures, monkeypatch):
+    monkeypatch.setitem(POSES, "c", look_at((0.05, 0.30, 0.36), (0.0, 0.02, 0.0)))
+    views = {name: view_of(pose) for name, pose in POSES.items()}
+    third = raster_of(photograph(Place(sky(LAMPS, 0.3), plane=True, reflectance=0.8), CAMERA, POSES["c"], 4, 0.005, 1))
+    off = {"a": (1.5, 0.0), "b": (0.0, 0.0), "c": (0.0, -1.5)}
+    found = {name: ball(name, off[name], 0.1) for name in POSES}
+    cameras = dict.fromkeys(POSES, CAMERA)
+    tied, numbers = shared_lamps.tied(found, {**pictures, "c": third}, cameras, views, RADIUS)
+    assert numbers["lamps"] == len(LAMPS)
+    assert numbers["freedoms"] == 4 * len(LAMPS)
+    raised = np.trace(tied["c"].fit.covariance) / np.trace(found["c"].fit.covariance)
+    assert raised == pytest.approx(numbers["chi2"] / numbers["freedoms"])
+    assert raised > 1
 
 
 def test_views_that_agree_stay(pictures):

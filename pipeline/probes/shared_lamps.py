@@ -34,7 +34,7 @@ SPOT_PX = 0.15  # of a spot's centroid; in a mosaic one of 3 px is off by up to 
 NEAREST_M = 1.5  # of lamps, as a sigma of the inverse distance
 NEAR_SIGMA, NEAR_RAD = 3.0, np.radians(3.0)  # within which spots may be one lamp: of the balls' directions, and apart
 SAME_LIGHT, SAME_COLOUR = np.log(1.6), np.log(1.3)
-ASTRAY = 16.0  # squared residual over sigma of a lamp with two freedoms: one in 3000
+ASTRAY = 1 / 3000  # chance of a lamp's residuals, below which its spots are several lamps
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,21 @@ def tied(
 
     As they were where fewer than two views show one lamp.
     """
+    from scipy.special import gammaincc
+
     seen = {name: _seen(found[name], photographs[name], cameras[name], views[name], radius, glass) for name in found}
     tracks = _tracks(list(seen.values()))
     while tracks:
         solved, total, chi2 = _adjusted(list(seen.values()), tracks, radius, glass)
-        worst = int(np.argmax(chi2))
-        if chi2[worst] <= ASTRAY:
+        freedoms = [2 * len(track) - 2 for track in tracks]
+        chances = gammaincc(np.array(freedoms) / 2, chi2 / 2)
+        worst = int(np.argmin(chances))
+        if chances[worst] >= ASTRAY:
             break
         tracks.pop(worst)
     if not tracks:
         return found, {"lamps": 0}
-    excess = max(1.0, total / (2 * len(tracks)))
+    excess = max(1.0, total / sum(freedoms))
     result, moved = dict(found), {}
     for number, name in enumerate(found):
         fit, change = found[name].fit, solved[6 * number : 6 * number + 3]
@@ -86,7 +90,7 @@ def tied(
         fit = replace(fit, centre=centre, covariance=excess * fit.covariance, radius_px=size)
         there = transform_points(views[name].world_from_camera, centre)
         result[name] = replace(found[name], fit=fit, centre_world=there)
-    return result, {"lamps": len(tracks), "chi2": total, "moved_px": moved}
+    return result, {"lamps": len(tracks), "chi2": total, "freedoms": sum(freedoms), "moved_px": moved}
 
 
 def reason(measured: dict[str, Any]) -> dict[str, Any]:
@@ -96,7 +100,7 @@ def reason(measured: dict[str, Any]) -> dict[str, Any]:
     row = {
         "term": "centres by lamps that several views mirror",
         "modelled": count > 0,
-        "because": f"{count} in the same place to chi2 {measured['chi2']:.1f} of {2 * count}: moved {moved}"
+        "because": f"{count} in the same place to chi2 {measured['chi2']:.1f} of {measured['freedoms']}: moved {moved}"
         if count
         else "no small lamp is mirrored in two views",
         "could_cost": "lamps that a map has twice, and twice the light where one view's weight ends",
