@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from ball_sights import BALL, CAMERA, POSES, RADIUS, ROOM, TRUE, channels, sights
 from mirror_scene import Dent, Place, photograph
+from scipy.ndimage import gaussian_filter
 
 from pipeline.conventions import invert_rigid, latlong_directions, latlong_solid_angles, transform_points
 from pipeline.light.harmonics import sh9_of_environment
 from pipeline.light.smooth import reduced, smooth_environment
 from pipeline.probes.ball_evidence import shape
-from pipeline.probes.ball_pairs import Sight, plane_pairs
+from pipeline.probes.ball_pairs import Pairs, Sight, plane_pairs
 from pipeline.probes.ball_shape import (
     FLOOR_PX,
     TOO_DENTED,
@@ -102,6 +103,26 @@ def test_too_little_texture_is_no_evidence():
     shifts = patch_shifts(plane_pairs(sights(False)["a"], every=True))
     few = tuple(part[:5] for part in shifts)
     assert dents(sights(False)["a"], 100.0, np.eye(3) * 1e-8, few) is None
+
+
+@pytest.mark.parametrize("aslant", [0.6, 1.0, -2.0])
+def test_grain_aslant_is_no_texture_to_find_a_place_by(aslant):
+    """Its patches slip along it by pixels; they made a sphere a dented ball where grain filled half of the grid."""
+    rows, columns = np.mgrid[:96, :96]
+    random = np.random.default_rng(5)
+    across = (columns + aslant * rows) / np.hypot(1, aslant)
+    grain = 0.2 * np.interp(across.ravel(), np.arange(-220, 240, 3.0), random.standard_normal(154))
+    print_ = gaussian_filter(random.standard_normal((96, 96)), 1.5).ravel()
+    for texture, least, most in ((grain, 0.0, 0.05), (grain + print_, 0.95, 1.0)):
+        direct = np.exp(texture)[:, None] * np.ones(3)
+        mirrored = direct * np.exp(0.02 * random.standard_normal((96 * 96, 1)))
+        none = np.zeros((96 * 96, 3))
+        pixel = np.stack([columns.ravel(), rows.ravel()], -1)
+        pairs = Pairs(pixel, none[:, 0], none, mirrored, none, direct, none, none, *none.T)
+        centres, shift, _ = patch_shifts(pairs)
+        assert least <= len(centres) / 15**2 <= most
+        if least:
+            assert np.median(np.linalg.norm(shift, axis=1)) < 0.1
 
 
 def band(seed: int, sigma: float) -> ViewMap:
