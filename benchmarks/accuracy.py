@@ -17,6 +17,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 Records = dict[str, Any]
 Value = Callable[[Records], float]
 CLASSES = ("pixels", "region means")  # of places, as the coverage's record has them
+CAPTURES = 100  # of a kind, from which on its coverage is a figure
 APART = ("object pixels", "shadow pixels", "object means", "shadow means")
 
 
@@ -71,9 +72,17 @@ def extremes(records: Records) -> float:
     return sum(row["ok"] for row in rows) / len(rows)
 
 
+def of_kind(records: Records, kind: str) -> Records:
+    """What the coverage's record says of a kind. Raises ValueError when too few captures of it were built."""
+    found: Records = records["budget"]["kinds"][kind]
+    if found["captures"] < CAPTURES:
+        raise ValueError(f"budget: {found['captures']} captures of {kind}, needed {CAPTURES}")
+    return found
+
+
 def bounded(kind: str) -> Value:
     """Least share, over kinds of places, of errors within 1.96 sigma and the bound that is named as not covered."""
-    return lambda records: float(min(records["budget"]["kinds"][kind]["bounded"].values()))
+    return lambda records: float(min(of_kind(records, kind)["bounded"].values()))
 
 
 def intervals(kind: str | None, places: tuple[str, ...]) -> Value:
@@ -83,8 +92,7 @@ def intervals(kind: str | None, places: tuple[str, ...]) -> Value:
     """
 
     def read(records: Records) -> float:
-        budget = records["budget"]
-        found = budget["kinds"][kind]["coverage"] if kind else budget["pooled"]
+        found = of_kind(records, kind)["coverage"] if kind else records["budget"]["pooled"]
         return float(sum(holds for place in places for holds in found[place]["truth"]["holds"].values()))
 
     return read

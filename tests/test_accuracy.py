@@ -35,6 +35,13 @@ def test_limits_from_above_and_from_below():
     assert judged(peer, {"merge": {"opencv_ms_per_mpx": 6.0, "ms_per_mpx": 1.0}})[1] == "**missed**"
 
 
+def test_coverage_of_few_captures_is_no_figure():
+    near = next(promise for promise in PROMISES if "bound that is named" in promise.what)
+    held = {"captures": 100, "bounded": {"object pixels": 0.99, "shadow pixels": 0.97}}
+    assert judged(near, {"budget": {"kinds": {"corner": held}}}) == ("0.97", "met")
+    assert judged(near, {"budget": {"kinds": {"corner": held | {"captures": 99}}}}) == ("-", "not measured")
+
+
 def test_the_table_of_figures_is_read():
     text = (
         "# Figures\n\n| capture | quality | object |\n|---|---|---|\n| desk | draft | 0.02 |\n\n## More\n| a | b | c |"
